@@ -1,0 +1,171 @@
+"""The messages: exactly one reply a request, N bots a message.
+
+This module knows nothing about bytes on a wire, arrays or turn order. A msgspec struct's tag travels as the field
+`type`; unknown fields are refused; a field added later gets a default. Shape letters as in `protocol.features`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from protocol.features import ActionSpec, CostModel, FeatureTable
+
+__all__ = [
+    "MAX_BOTS_PER_MESSAGE",
+    "MAX_FRAME",
+    "PROTOCOL_VERSION",
+    "Actions",
+    "Bits",
+    "Blob",
+    "BotsStarted",
+    "BotsStopped",
+    "Error",
+    "Farewell",
+    "Goodbye",
+    "Hello",
+    "Queries",
+    "Reply",
+    "Request",
+    "RequestQueries",
+    "StartBots",
+    "StopBots",
+    "SubmitFeatures",
+    "Welcome",
+]
+
+PROTOCOL_VERSION = 1
+MAX_BOTS_PER_MESSAGE = 65536
+MAX_FRAME = 2**53  # the largest count that a JSON number or a double holds exactly
+
+Blob = bytes | list[list[float]]
+"""float32 [N, n]: little-endian row-major bytes in msgpack, nested lists in JSON."""
+Bits = bytes | list[list[Annotated[int, Meta(ge=0, le=1)]]]
+"""bool [N, M]: ceil(M / 8) bytes a row, feature i is bit i % 8 of byte i // 8; rows of 0/1 in JSON."""
+
+_Frame = Annotated[int, Meta(ge=0, le=MAX_FRAME)]
+_Count = Annotated[int, Meta(ge=1, le=MAX_BOTS_PER_MESSAGE)]
+_Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Handle = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Handles = Annotated[list[_Handle], Meta(min_length=1, max_length=MAX_BOTS_PER_MESSAGE)]
+_PerBot = Annotated[list[float], Meta(max_length=MAX_BOTS_PER_MESSAGE)]
+_Token = Annotated[str, Meta(max_length=1024)]
+
+
+class _Message(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type"):
+    pass
+
+
+class Hello(_Message, frozen=True, tag="hello"):
+    """Open a connection. `cost_model` is the engine's own measurement; without it the bundle's declared costs count."""
+
+    protocol: int = PROTOCOL_VERSION
+    cost_model: CostModel | None = None
+    token: _Token | None = None
+
+
+class Welcome(_Message, frozen=True, tag="welcome"):
+    """The connection's name, what is served, what it costs and every limit. `budget_us` is a bot's default budget."""
+
+    connection: str
+    bundle: str
+    features: FeatureTable
+    action: ActionSpec
+    cost_model: CostModel
+    budget_us: float
+    context_length: int
+    max_bots: int
+    max_body_bytes: int
+
+
+class StartBots(_Message, frozen=True, tag="start_bots"):
+    """Start `count` bots; each list, where given, has one entry a bot."""
+
+    count: _Count
+    seeds: Annotated[list[_Seed], Meta(max_length=MAX_BOTS_PER_MESSAGE)] | None = None
+    target_returns: _PerBot | None = None
+    budgets_us: _PerBot | None = None
+
+
+class BotsStarted(_Message, frozen=True, tag="bots_started"):
+    """Opaque 63-bit handles, in the order of the request."""
+
+    bots: list[_Handle]
+
+
+class RequestQueries(_Message, frozen=True, tag="request_queries"):
+    """Ask which costly features to acquire. `free` is [N, F]; `rewards` [N] came since each bot's last frame.
+
+    `frame_budget_us` is shared by all bots of the message, on top of each bot's own budget.
+    """
+
+    frame: _Frame
+    bots: _Handles
+    free: Blob
+    rewards: _PerBot | None = None
+    frame_budget_us: float | None = None
+
+
+class Queries(_Message, frozen=True, tag="queries"):
+    """The queries, bits [N, M], their predicted cost [N] in µs and the time spent deciding, in µs."""
+
+    frame: _Frame
+    queries: Bits
+    cost_us: list[float]
+    infer_us: float
+
+
+class SubmitFeatures(_Message, frozen=True, tag="submit_features"):
+    """What was acquired for the pending queries of the same bots in the same order.
+
+    `acquired` and `failed` are bits [N, M]. `values` is ragged: for each bot in order, for each acquired feature in
+    order, its `size` numbers (float32 little-endian bytes, or one list a bot).
+    """
+
+    frame: _Frame
+    bots: _Handles
+    acquired: Bits
+    values: Blob
+    failed: Bits | None = None
+
+
+class Actions(_Message, frozen=True, tag="actions"):
+    """The actions [N, A]; why each bot got its action (0 = learned) [N]; the time spent deciding, in µs."""
+
+    frame: _Frame
+    actions: Blob
+    reasons: list[int]
+    infer_us: float
+
+
+class StopBots(_Message, frozen=True, tag="stop_bots"):
+    """End these bots; their handles are never used again."""
+
+    bots: _Handles
+
+
+class BotsStopped(_Message, frozen=True, tag="bots_stopped"):
+    """How many bots ended."""
+
+    count: int
+
+
+class Goodbye(_Message, frozen=True, tag="goodbye"):
+    """End the connection and its bots."""
+
+
+class Farewell(_Message, frozen=True, tag="farewell"):
+    """The connection has ended."""
+
+
+class Error(_Message, frozen=True, tag="error"):
+    """The request was refused and changed nothing. `code` is one of `protocol.errors`."""
+
+    code: str
+    detail: str
+    retry_after_s: float | None = None
+
+
+Request = Hello | StartBots | RequestQueries | SubmitFeatures | StopBots | Goodbye
+Reply = Welcome | BotsStarted | Queries | Actions | BotsStopped | Farewell | Error
