@@ -1,0 +1,91 @@
+"""Bytes to messages and back: the server's side, typed and bounded.
+
+This module knows nothing about sockets, HTTP, bots or what the numbers in a message mean (`protocol.arrays` does). Whatever bytes come in, nothing but a ProtocolError comes out.
+Clients do not use it: `protocol.client` packs and unpacks on its own, so that two implementations meet in every test.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from functools import cache
+from typing import Any, TypeVar, cast
+
+import msgspec
+
+from protocol.errors import BadJson, BadMsgpack, BadSchema, ProtocolError, TooDeep
+from protocol.features import FeatureTable
+from protocol.messages import Reply, Request
+
+__all__ = ["MAX_DETAIL_CHARS", "Format", "body_limit", "decode", "decode_request", "encode"]
+
+MAX_DETAIL_CHARS = 300
+_NUMBER_BYTES = 26  # the longest double in JSON with its comma; 9 in msgpack
+_HANDLE_BYTES = 21  # a 63-bit integer in JSON with its comma
+_BIT_BYTES = 2  # `0,`
+_FIXED_BYTES = 16384  # names, brackets, the longest token with every character escaped
+
+Message = TypeVar("Message", bound=msgspec.Struct)
+
+
+class Format(Enum):
+    """How a message is written; the value is its HTTP content type."""
+
+    MSGPACK = "application/msgpack"
+    JSON = "application/json"
+
+
+def body_limit(table: FeatureTable, max_bots: int) -> int:
+    """Bytes of the largest message that can make sense: `max_bots` bots of this table, written as JSON at its widest.
+
+    A bot needs at most 26 bytes a number, for F + 1 numbers in a request or D numbers and 2 M bits in a submission.
+    """
+    per_request = _NUMBER_BYTES * (table.n_free + 1)
+    per_submission = _NUMBER_BYTES * table.n_costly + 2 * _BIT_BYTES * table.n_queries
+    per_bot = _HANDLE_BYTES + 16 + max(per_request, per_submission, 3 * _NUMBER_BYTES)
+    return _FIXED_BYTES + _NUMBER_BYTES * table.n_queries + per_bot * max_bots
+
+
+def decode(body: bytes, form: Format, message: type[Message]) -> Message:
+    """One message of a known type; its `type` field may be left out.
+
+    Raises BadMsgpack or BadJson (malformed, truncated, trailing bytes), TooDeep, BadSchema.
+    """
+    return cast("Message", _decode(body, form, message))
+
+
+def decode_request(body: bytes, form: Format) -> Request:
+    """One request of whichever type its `type` field names; raises as `decode` does."""
+    return cast("Request", _decode(body, form, Request))
+
+
+def encode(reply: Reply | Request, form: Format) -> bytes:
+    """The bytes of one message. Its blobs must already be in this format (`protocol.arrays`)."""
+    return msgspec.msgpack.encode(reply) if form is Format.MSGPACK else msgspec.json.encode(reply)
+
+
+@cache
+def _decoder(form: Format, message: Any) -> msgspec.msgpack.Decoder[Any] | msgspec.json.Decoder[Any]:
+    return msgspec.msgpack.Decoder(message) if form is Format.MSGPACK else msgspec.json.Decoder(message)
+
+
+def _decode(body: bytes, form: Format, message: Any) -> Any:
+    try:
+        return _decoder(form, message).decode(body)
+    except RecursionError:
+        raise TooDeep("the body is nested deeper than any message") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise _refusal(body, form, error) from None
+
+
+def _refusal(body: bytes, form: Format, error: Exception) -> ProtocolError:
+    """msgspec stops at the first fault it meets; a body that is broken further on is broken, not of a wrong schema."""
+    malformed = BadMsgpack if form is Format.MSGPACK else BadJson
+    try:
+        _decoder(form, msgspec.Raw).decode(body)
+    except RecursionError:
+        return TooDeep("the body is nested deeper than any message")
+    except msgspec.DecodeError as broken:
+        return malformed(str(broken)[:MAX_DETAIL_CHARS])
+    if isinstance(error, msgspec.ValidationError):
+        return BadSchema(str(error)[:MAX_DETAIL_CHARS])
+    return malformed(str(error)[:MAX_DETAIL_CHARS])
