@@ -1,4 +1,4 @@
-"""The blobs, bits and ragged values of a message to numpy arrays and back: shapes, finiteness and ranges are checked here.
+"""The blobs, bits and ragged values of a message to numpy arrays and back, shapes, finiteness and ranges checked.
 
 This module knows nothing about messages, sockets or bots. Shape letters as in `protocol.features`.
 """

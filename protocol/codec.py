@@ -1,7 +1,8 @@
 """Bytes to messages and back: the server's side, typed and bounded.
 
-This module knows nothing about sockets, HTTP, bots or what the numbers in a message mean (`protocol.arrays` does). Whatever bytes come in, nothing but a ProtocolError comes out.
-Clients do not use it: `protocol.client` packs and unpacks on its own, so that two implementations meet in every test.
+This module knows nothing about sockets, HTTP, bots or what the numbers in a message mean (`protocol.arrays` does).
+Whatever bytes come in, nothing but a ProtocolError comes out. Clients do not use it:
+`protocol.client` packs and unpacks on its own, so that two implementations meet in every test.
 """
 
 from __future__ import annotations

@@ -1,0 +1,165 @@
+"""BotClient: the blocking client that clients in other languages follow, over HTTP, TCP or a Unix socket.
+
+This module knows nothing about bots or how the server reads what it sends: it packs and unpacks with the `msgpack`
+package, plain dicts and numpy, on purpose not with `protocol.codec`. Shape letters as in `protocol.features`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import msgpack
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from protocol.errors import BadShape, NoConnection, ProtocolError
+from protocol.features import CostModel
+from protocol.replies import Actions, Queries, Welcome, read_actions, read_queries, read_reply, read_welcome
+from protocol.transport import ReplyError, open_transport
+
+__all__ = ["Actions", "BotClient", "Queries", "ReplyError", "Welcome"]
+
+
+class BotClient:
+    """One connection to a server at `http://host:port`, `tcp://host:port` or `unix:///path`.
+
+    Every method raises the ProtocolError of the server's answer; OSError (TimeoutError, ConnectionError, ReplyError)
+    where there is none. A socket that failed is closed: over HTTP the next call opens another and the connection goes
+    on; over TCP and Unix sockets the connection and its bots have ended, so say hello again.
+    """
+
+    def __init__(self, url: str, *, timeout_s: float = 5.0) -> None:
+        self._transport = open_transport(url, timeout_s)
+        self._welcome: Welcome | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def hello(self, *, cost_model: CostModel | None = None, token: str | None = None) -> Welcome:
+        """Open a connection, with the engine's own cost model if it has measured one."""
+        self._welcome = None
+        message: dict[str, Any] = {"type": "hello", "protocol": 1}
+        if cost_model is not None:
+            message["cost_model"] = _cost_model_dict(cost_model)
+        if token is not None:
+            message["token"] = token
+        self._welcome = read_welcome(self.exchange(message))
+        return self._welcome
+
+    def start(
+        self,
+        count: int,
+        *,
+        seeds: Sequence[int] | None = None,
+        target_returns: Sequence[float] | None = None,
+        budgets_us: Sequence[float] | None = None,
+    ) -> NDArray[np.int64]:
+        """Start bots; each sequence, where given, has one entry a bot. Returns their handles, int64 [count]."""
+        message: dict[str, Any] = {"type": "start_bots", "count": int(count)}
+        if seeds is not None:
+            message["seeds"] = [int(seed) for seed in seeds]
+        _add_numbers(message, "target_returns", target_returns)
+        _add_numbers(message, "budgets_us", budgets_us)
+        return np.array(self.exchange(message)["bots"], dtype=np.int64)
+
+    def query(
+        self,
+        bots: ArrayLike,
+        frame: int,
+        free: ArrayLike,
+        rewards: ArrayLike | None = None,
+        frame_budget_us: float | None = None,
+    ) -> Queries:
+        """Ask which costly features to acquire, given `free` [N, F] and the `rewards` [N] since each bot's last frame.
+
+        `frame_budget_us` is shared by all these bots, on top of each bot's own budget. Raises BadShape locally too.
+        """
+        table = self._connected().features
+        handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
+        free_NF = _matrix(free, "<f4", (len(handles), table.n_free), "free")
+        message = {"type": "request_queries", "frame": int(frame), "bots": handles, "free": free_NF.tobytes()}
+        _add_numbers(message, "rewards", rewards)
+        if frame_budget_us is not None:
+            message["frame_budget_us"] = float(frame_budget_us)
+        return read_queries(self._framed(message), len(handles), table)
+
+    def act(
+        self, bots: ArrayLike, frame: int, acquired: ArrayLike, costly: ArrayLike, failed: ArrayLike | None = None
+    ) -> Actions:
+        """Answer the pending query of the same bots and frame, and get their actions.
+
+        `acquired` and `failed` are bool [N, M], together exactly what was asked for; `costly` is [N, D], of which only
+        the acquired numbers are read and sent. Raises BadShape locally too.
+        """
+        welcome = self._connected()
+        table = welcome.features
+        handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
+        acquired_NM = _matrix(acquired, "?", (len(handles), table.n_queries), "acquired")
+        costly_ND = _matrix(costly, "<f4", (len(handles), table.n_costly), "costly")
+        message = {"type": "submit_features", "frame": int(frame), "bots": handles}
+        message["acquired"] = _pack_bits(acquired_NM)
+        message["values"] = costly_ND[np.repeat(acquired_NM, table.sizes, axis=1)].tobytes()
+        if failed is not None:
+            message["failed"] = _pack_bits(_matrix(failed, "?", acquired_NM.shape, "failed"))
+        return read_actions(self._framed(message), len(handles), welcome.action)
+
+    def stop(self, bots: ArrayLike) -> int:
+        """End these bots; returns how many ended."""
+        handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
+        return int(self.exchange({"type": "stop_bots", "bots": handles})["count"])
+
+    def close(self) -> None:
+        """End the connection and its bots, and close the socket. A server that is gone already is no error."""
+        try:
+            if self._welcome is not None:
+                self.exchange({"type": "goodbye"})
+        except (OSError, ProtocolError):
+            pass  # the connection has ended, which is what was asked for
+        finally:
+            self._welcome = None
+            self._transport.close()
+
+    def exchange(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Send any message, as a dict, and return its reply's dict: the door for tests and for messages to come."""
+        connection = None if self._welcome is None else self._welcome.connection
+        body = self._transport.exchange(message["type"], msgpack.packb(message), connection)
+        return read_reply(body, message["type"])
+
+    def _framed(self, message: dict[str, Any]) -> dict[str, Any]:
+        reply = self.exchange(message)
+        if reply.get("frame") != message["frame"]:
+            self._transport.close()
+            raise ReplyError(f"the reply is for frame {reply.get('frame')!r}, expected {message['frame']}")
+        return reply
+
+    def _connected(self) -> Welcome:
+        if self._welcome is None:
+            raise NoConnection("say hello first")
+        return self._welcome
+
+
+def _cost_model_dict(cost_model: CostModel) -> dict[str, Any]:
+    return {"call_us": float(cost_model.call_us), "feature_us": [float(us) for us in cost_model.feature_us]}
+
+
+def _add_numbers(message: dict[str, Any], name: str, values: ArrayLike | None) -> None:
+    if values is not None:
+        message[name] = np.asarray(values, dtype=np.float64).tolist()
+
+
+def _matrix(array: ArrayLike, dtype: str, shape: tuple[int, ...], name: str) -> NDArray[Any]:
+    matrix = np.ascontiguousarray(array, dtype=dtype)
+    if matrix.shape != shape:
+        raise BadShape(f"{name} has shape {list(matrix.shape)}, expected {list(shape)}")
+    return matrix
+
+
+def _pack_bits(array_NM: NDArray[np.bool_]) -> bytes:
+    return np.packbits(array_NM, axis=1, bitorder="little").tobytes()

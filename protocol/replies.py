@@ -1,0 +1,124 @@
+"""What a server answers, as a client sees it: msgpack to dicts to small named tuples of numpy arrays.
+
+This module knows nothing about sockets or requests. It reads with the `msgpack` package, never with `protocol.codec`:
+see `protocol.client`. Whatever the bytes, it raises only ReplyError or the ProtocolError that the server sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.errors import ERRORS_BY_CODE, InternalError, ProtocolError
+from protocol.features import ActionComponent, ActionSpec, CostModel, Feature, FeatureTable
+from protocol.transport import ReplyError
+
+__all__ = ["Actions", "Queries", "Welcome", "read_actions", "read_queries", "read_reply", "read_welcome"]
+
+_MAX_ARRAY = 65536  # msgpack reserves memory for the length that an array claims
+_REPLY_TO = {
+    "hello": "welcome",
+    "start_bots": "bots_started",
+    "request_queries": "queries",
+    "submit_features": "actions",
+    "stop_bots": "bots_stopped",
+    "goodbye": "farewell",
+}
+
+
+class Welcome(NamedTuple):
+    """What the server answers to hello: its bundle's features, action, costs and limits."""
+
+    connection: str
+    bundle: str
+    features: FeatureTable
+    action: ActionSpec
+    cost_model: CostModel
+    budget_us: float
+    context_length: int
+    max_bots: int
+    max_body_bytes: int
+
+
+class Queries(NamedTuple):
+    """Which costly features to acquire: `queries` bool [N, M], `cost_us` float64 [N] predicted, `infer_us` spent."""
+
+    frame: int
+    queries: NDArray[np.bool_]
+    cost_us: NDArray[np.float64]
+    infer_us: float
+
+
+class Actions(NamedTuple):
+    """What to do: `actions` float32 [N, A]; `reasons` uint8 [N], 0 = learned; `infer_us` spent."""
+
+    frame: int
+    actions: NDArray[np.float32]
+    reasons: NDArray[np.uint8]
+    infer_us: float
+
+
+def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
+    """The reply's fields; raises the ProtocolError that an `error` message names, ReplyError if this is no answer."""
+    with _reading(request_type):
+        reply = dict(msgpack.unpackb(body, max_array_len=_MAX_ARRAY))
+        kind = reply["type"]
+    if kind == "error":
+        raise _refused(reply)
+    if kind != _REPLY_TO[request_type]:
+        raise ReplyError(f"the reply to {request_type} is {kind!r}, expected {_REPLY_TO[request_type]!r}")
+    return reply
+
+
+def read_welcome(reply: dict[str, Any]) -> Welcome:
+    """The fields of a `welcome`; raises ReplyError."""
+    with _reading("hello"):
+        return Welcome(
+            connection=str(reply["connection"]),
+            bundle=str(reply["bundle"]),
+            features=FeatureTable(tuple(Feature(**feature) for feature in reply["features"]["features"])),
+            action=ActionSpec(tuple(ActionComponent(**component) for component in reply["action"]["components"])),
+            cost_model=CostModel(reply["cost_model"]["call_us"], tuple(reply["cost_model"]["feature_us"])),
+            budget_us=float(reply["budget_us"]),
+            context_length=int(reply["context_length"]),
+            max_bots=int(reply["max_bots"]),
+            max_body_bytes=int(reply["max_body_bytes"]),
+        )
+
+
+def read_queries(reply: dict[str, Any], bots: int, table: FeatureTable) -> Queries:
+    """The fields of a `queries` for N = `bots`; raises ReplyError."""
+    with _reading("request_queries"):
+        bytes_NB = np.frombuffer(reply["queries"], dtype=np.uint8).reshape(bots, -(-table.n_queries // 8))
+        queries_NM = np.unpackbits(bytes_NB, axis=1, count=table.n_queries, bitorder="little").view(np.bool_)
+        cost_us_N = np.array(reply["cost_us"], dtype=np.float64).reshape(bots)
+        return Queries(int(reply["frame"]), queries_NM, cost_us_N, float(reply["infer_us"]))
+
+
+def read_actions(reply: dict[str, Any], bots: int, action: ActionSpec) -> Actions:
+    """The fields of an `actions` for N = `bots`; raises ReplyError."""
+    with _reading("submit_features"):
+        actions_NA = np.frombuffer(reply["actions"], dtype="<f4").reshape(bots, action.size)
+        reasons_N = np.array(reply["reasons"], dtype=np.uint8).reshape(bots)
+        return Actions(int(reply["frame"]), actions_NA, reasons_N, float(reply["infer_us"]))
+
+
+@contextmanager
+def _reading(request_type: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise ReplyError(f"the reply to {request_type} is not what the protocol says: {error!r}") from error
+
+
+def _refused(reply: dict[str, Any]) -> ProtocolError:
+    code, detail = str(reply.get("code")), str(reply.get("detail"))
+    refusal = ERRORS_BY_CODE.get(code)
+    if refusal is None:  # the code of a newer server
+        return InternalError(f"{code}: {detail}")
+    return refusal(detail, retry_after_s=reply.get("retry_after_s"))
