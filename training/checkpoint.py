@@ -1,0 +1,123 @@
+"""What only torch reads: everything needed to go on training, and everything needed to export a bundle.
+
+Tensors and plain values only, read with `weights_only=True`: a checkpoint cannot carry code.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+import torch
+
+from protocol.features import ActionSpec, FeatureTable
+from training.config import TrainConfig
+from training.models import BudgetedDecisionTransformer, ModelConfig
+from training.traces import Traces
+
+if TYPE_CHECKING:
+    from training.train import TrainState
+
+__all__ = ["Facts", "Trained", "load_checkpoint", "load_trained", "save_checkpoint"]
+
+_GOLDEN_CANDIDATES = 8  # episodes looked at when one is chosen for golden.npz
+_GOLDEN_TURNS = 128
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a bundle must say of the traces that it was trained on."""
+
+    features: FeatureTable
+    action: ActionSpec
+    target_return: float
+    golden: dict[str, torch.Tensor]  # free [T, F], costly [T, D], rewards [T] of one recorded episode
+
+    @classmethod
+    def of(cls, traces: Traces, target_return: float | None) -> Facts:
+        """The facts of these traces; `target_return` None takes the 90th percentile of their returns."""
+        episode = int(traces.lengths_E[:_GOLDEN_CANDIDATES].argmax())
+        start = int(traces.starts_E[episode])
+        turns = slice(start, start + min(int(traces.lengths_E[episode]), _GOLDEN_TURNS))
+        togo = traces.returns_to_go_S[turns]
+        golden = {
+            "free": traces.free_SF[turns].clone(),
+            "costly": traces.costly_SD[turns].float(),
+            # A turn's reward is the one since the turn before it.
+            "rewards": torch.cat([torch.zeros(1), togo[:-1] - togo[1:]]),
+        }
+        if target_return is None:
+            target_return = float(np.percentile(traces.episode_returns_E, 90))
+        return cls(traces.features, traces.action, target_return, golden)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A finished (or interrupted) run, ready for export."""
+
+    config: TrainConfig
+    facts: Facts
+    model: BudgetedDecisionTransformer
+    done: int
+
+
+def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainState) -> None:
+    """Write atomically: a run that is killed keeps its last whole checkpoint."""
+    data: dict[str, Any] = {
+        "config": msgspec.json.encode(asdict(config), enc_hook=str).decode(),
+        "model_config": msgspec.json.encode(state.model.config).decode(),
+        "features": msgspec.json.encode(facts.features).decode(),
+        "action": msgspec.json.encode(facts.action).decode(),
+        "target_return": facts.target_return,
+        "golden": facts.golden,
+        "model": state.model.state_dict(),
+        "optimiser": state.optimiser.state_dict(),
+        "batches": json.dumps(state.batches.bit_generator.state),
+        "uniforms": state.uniforms.get_state(),
+        "done": state.done,
+        "penalty_weight": state.penalty_weight,
+        "seconds": state.seconds,
+    }
+    partial = path.with_suffix(".partial")
+    torch.save(data, partial)
+    os.replace(partial, path)
+
+
+def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
+    """Continue a run: its settings must be those it began with, but for how long it goes on. Raises ValueError."""
+    data = torch.load(path, weights_only=True)
+    theirs, ours = _decode_config(data["config"]), config
+    for name, value in asdict(ours).items():
+        if name not in ("out", "updates", "log_every", "checkpoint_every") and getattr(theirs, name) != value:
+            raise ValueError(
+                f"{path} was trained with {name} {getattr(theirs, name)}, this run has {value}: use another out"
+            )
+    state.model.load_state_dict(data["model"])
+    state.optimiser.load_state_dict(data["optimiser"])
+    state.batches.bit_generator.state = json.loads(data["batches"])
+    state.uniforms.set_state(data["uniforms"])
+    state.done, state.penalty_weight, state.seconds = data["done"], data["penalty_weight"], data["seconds"]
+
+
+def load_trained(path: Path) -> Trained:
+    """Read the network and facts of a run, for export."""
+    data = torch.load(path, weights_only=True)
+    model = BudgetedDecisionTransformer(msgspec.json.decode(data["model_config"], type=ModelConfig))
+    model.load_state_dict(data["model"])
+    model.eval()
+    facts = Facts(
+        msgspec.json.decode(data["features"], type=FeatureTable),
+        msgspec.json.decode(data["action"], type=ActionSpec),
+        data["target_return"],
+        data["golden"],
+    )
+    return Trained(_decode_config(data["config"]), facts, model, data["done"])
+
+
+def _decode_config(text: str) -> TrainConfig:
+    return msgspec.convert(msgspec.json.decode(text), TrainConfig, dec_hook=lambda kind, value: kind(value))

@@ -1,0 +1,74 @@
+"""What one training run is: a frozen dataclass that makes the command line and is written beside the result."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+__all__ = ["TrainConfig"]
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One run of Algorithm 1. Lengths in timesteps, costs as shares of the full cost."""
+
+    dataset: Path  # Minari dataset folder, such as data/navigation/hard-expert-v0
+    out: Path  # folder of the run: config, checkpoint, metrics and curves
+    name: str  # name of the bundle made from this run
+    environment: str = ""  # gymnasium id that evaluation plays, such as game.env:game/Navigation-hard-v0
+    seed: int = 0
+    episodes: int | None = None  # read only the first so many episodes (None: all)
+
+    acquisition: Literal["learned", "all", "none"] = "learned"  # learn the queries, or force all or none
+    budget: float = 0.1  # C: most that a query may cost, as a share of the full cost (Eq. 1)
+    penalty_step: float = 0.001  # ε: what γ rises by after a batch that violated the budget (Alg. 1)
+    acquisition_bias: float = 0.0  # initial logit of every query probability
+    sweeps: int = 2  # backward sweeps of the query's adjoint (training/acquisition.py)
+    frame_budget: float = 0.2  # hard cap of one bot's query at run time, unless the engine sets another (bursts pass C)
+    target_return: float | None = None  # return asked for at run time (None: 90th percentile of the traces)
+
+    bins: tuple[int, ...] = (11, 3, 2)  # bins of each action component
+    sampled: tuple[str, ...] = ()  # action components sampled from their bins instead of taking the most probable
+
+    context_length: int = 20  # K
+    window: int = 40  # timesteps in a training window
+    width: int = 64  # W
+    n_layers: int = 2  # L
+    n_heads: int = 4  # H
+    encoder_width: int = 128  # hidden width of the token encoder and acquisition head
+    fourier: int = 4  # octaves of each free number
+
+    batch: int = 64  # windows in an update
+    updates: int = 4000
+    learning_rate: float = 2e-3
+    warmup: int = 100  # updates of linear warm-up, then a cosine to zero
+    weight_decay: float = 1e-2
+    gradient_clip: float = 1.0
+
+    log_every: int = 50  # updates between lines of metrics
+    checkpoint_every: int = 500  # updates between checkpoints
+
+    def __post_init__(self) -> None:
+        for name in ("budget", "frame_budget"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected a share of the full cost in [0, 1]")
+        if self.width % self.n_heads:
+            raise ValueError(f"width {self.width} is not a multiple of n_heads {self.n_heads}")
+        if self.context_length < 2:
+            raise ValueError(f"context_length is {self.context_length}, expected 2 or more")
+
+    @classmethod
+    def read(cls, path: Path) -> TrainConfig:
+        """Read a configuration written by `write` or by hand; unknown keys are errors."""
+        data = msgspec.json.decode(path.read_bytes())
+        known = {field.name for field in fields(cls)}
+        if unknown := set(data) - known:
+            raise ValueError(f"{path}: unknown settings {sorted(unknown)}")
+        return msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
+
+    def write(self, path: Path) -> None:
+        """Write every setting as JSON."""
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(asdict(self), enc_hook=str), indent=2) + b"\n")

@@ -1,0 +1,189 @@
+"""From a run's checkpoint to a bundle: `python -m training.export runs/hard bundles/hard`.
+
+Writes acquisition.onnx, action.onnx, golden.npz and manifest.json, then loads the bundle with the runtime's own loader,
+which replays the golden episode: a bundle that leaves here has passed the check that a server makes. The files that
+made it (config.json, versions.json, metrics.jsonl) are copied beside it, with the training curves as a picture.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import shutil
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+
+from bot_runtime.bundle import Bundle
+from bot_runtime.manifest import FILES, SCHEMA_VERSION, FileEntry, Manifest
+from bot_runtime.noise import uniforms
+from training.checkpoint import Trained, load_trained
+from training.curves import plot_curves
+from training.graphs import AcquisitionGraph, ActionGraph
+
+__all__ = ["ExportConfig", "export", "golden_episode", "write_graphs"]
+
+_COPIED = ("config.json", "versions.json", "metrics.jsonl")
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """What to export, and where to."""
+
+    run: tyro.conf.Positional[Path]  # folder written by training.train
+    out: tyro.conf.Positional[Path]  # folder of the bundle; replaced if it exists
+    tolerance: float = 1e-4  # largest |Δ| between torch and ONNX that is accepted
+
+
+def write_graphs(trained: Trained, folder: Path) -> None:
+    """acquisition.onnx and action.onnx, with a dynamic number of bots N."""
+    model, config = trained.model, trained.model.config
+    n, slots, head = 2, config.context_length - 1, config.width // config.n_heads
+    free, togo = torch.zeros(n, config.n_free), torch.zeros(n, 1)
+    hidden = torch.zeros(n, config.width)
+    cache = torch.zeros(config.n_layers, n, config.n_heads, slots, head)
+    costly, query = torch.zeros(n, len(config.owner)), torch.zeros(n, config.n_queries)
+    noise, ages = torch.zeros(n, len(config.bins)), torch.full((n, slots), config.context_length)
+    bots = torch.export.Dim("N")
+    _write(
+        AcquisitionGraph(model),
+        {"hidden": hidden, "free": free, "returns_to_go": togo},
+        {name: {0: bots} for name in ("hidden", "free", "returns_to_go")},
+        ["query_probs"],
+        folder / "acquisition.onnx",
+    )
+    rows = {"free": free, "costly": costly, "query": query, "returns_to_go": togo, "noise": noise}
+    _write(
+        ActionGraph(model),
+        {**rows, "keys": cache, "values": cache.clone(), "ages": ages},
+        {**{name: {0: bots} for name in (*rows, "ages")}, "keys": {1: bots}, "values": {1: bots}},
+        ["action", "hidden", "new_keys", "new_values"],
+        folder / "action.onnx",
+    )
+
+
+def _write(
+    graph: torch.nn.Module,
+    inputs: dict[str, torch.Tensor],
+    dynamic: dict[str, dict[int, torch.export.Dim]],
+    outputs: list[str],
+    path: Path,
+) -> None:
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        # The exporter warns of its own internals (deprecated calls, copied nodes): nothing that a user can act on.
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            graph.eval(),
+            args=(),
+            kwargs=inputs,
+            dynamo=True,
+            dynamic_shapes=dynamic,
+            input_names=list(inputs),
+            output_names=outputs,
+            optimize=True,
+            verbose=False,
+        )
+    program.save(path, external_data=False)
+
+
+@torch.no_grad()
+def golden_episode(trained: Trained, seed: int = 0) -> dict[str, np.ndarray]:
+    """What the network does over one recorded episode, computed by torch over the whole episode at once, not
+    incrementally: replaying it proves torch = ONNX = incremental. Queries are sampled with the runtime's own noise."""
+    model, facts = trained.model, trained.facts
+    free, costly, rewards = (facts.golden[name] for name in ("free", "costly", "rewards"))
+    turns, n_queries = len(free), model.config.n_queries
+    noise = uniforms(np.full(turns, seed, np.uint64), np.arange(turns), n_queries + len(model.config.bins))
+    noise_BTn = torch.from_numpy(noise)[None]
+    togo = facts.target_return - rewards.cumsum(0)
+    context = model.context(free[None], togo[None, :, None])
+    hidden, query = torch.zeros(1, 1, model.config.width), torch.zeros(1, turns, n_queries)
+    for t in range(turns):
+        probs = model.query_probs(hidden, context[:, t : t + 1])
+        query[:, t : t + 1] = (noise_BTn[:, t : t + 1, :n_queries] < probs).float()
+        hidden = model.trunk(model.tokens(context[:, : t + 1], costly[None, : t + 1], query[:, : t + 1]))[:, -1:]
+    hidden = model.trunk(model.tokens(context, costly[None], query))
+    return {
+        "seed": np.uint64(seed),
+        "target_return": np.float32(facts.target_return),
+        "free": free.numpy(),
+        "costly": costly.numpy(),
+        "rewards": rewards.numpy(),
+        "probs": model.query_probs(model.shift(hidden), context)[0].numpy(),
+        "queries": query[0].numpy().astype(np.uint8),
+        "actions": model.actions(hidden, noise_BTn[..., n_queries:])[0].numpy(),
+        "hidden": hidden[0].numpy(),
+    }
+
+
+def export(config: ExportConfig) -> Bundle:
+    """Write the bundle, verify it, put it in place; an existing bundle is replaced only by one that verified."""
+    trained = load_trained(config.run / "checkpoint.pt")
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=config.out.parent, prefix=".export-") as scratch:
+        folder = Path(scratch) / config.out.name
+        folder.mkdir()
+        write_graphs(trained, folder)
+        np.savez_compressed(folder / "golden.npz", **golden_episode(trained))
+        manifest = _manifest(trained, folder, config.tolerance)
+        (folder / "manifest.json").write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+        bundle = Bundle.load(folder)
+        for name in _COPIED:
+            shutil.copy(config.run / name, folder / name)
+        plot_curves(folder / "metrics.jsonl", folder / "curves.png", trained.config)
+        if config.out.exists():
+            shutil.rmtree(config.out)
+        os.replace(folder, config.out)
+    return bundle
+
+
+def _manifest(trained: Trained, folder: Path, tolerance: float) -> Manifest:
+    config, facts, sizes = trained.config, trained.facts, trained.model.config
+    files = {}
+    for name in FILES:
+        data = (folder / name).read_bytes()
+        files[name] = FileEntry(sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
+    return Manifest(
+        schema_version=SCHEMA_VERSION,
+        name=config.name,
+        method="bdt",
+        features=facts.features,
+        action=facts.action,
+        context_length=sizes.context_length,
+        n_layers=sizes.n_layers,
+        n_heads=sizes.n_heads,
+        head_dim=sizes.width // sizes.n_heads,
+        width=sizes.width,
+        target_return=facts.target_return,
+        budget=config.frame_budget,
+        tolerance=tolerance,
+        files=files,
+        provenance={
+            "dataset": config.dataset.name,
+            "environment": config.environment,
+            "seed": str(config.seed),
+            "updates": str(trained.done),
+            "acquisition": config.acquisition,
+            "trained_budget": str(config.budget),
+        },
+    )
+
+
+def main() -> None:
+    """Command line."""
+    bundle = export(tyro.cli(ExportConfig, description=__doc__))
+    manifest = bundle.manifest
+    Console().print(f"bundle {manifest.name}: verified, {sum(file.bytes for file in manifest.files.values()):,} bytes")
+
+
+if __name__ == "__main__":
+    main()
