@@ -1,0 +1,1 @@
+"""What runs inside a frame: bundles, policies, contexts, budgets and the Bots façade. Never imports torch."""

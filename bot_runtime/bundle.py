@@ -1,0 +1,132 @@
+"""A bundle on disk becomes a verified bundle in memory, or BadBundle.
+
+This module knows nothing about bots, turns or servers. Hashes guard against damage, not against an author: whoever can
+write the manifest can write matching hashes. What stands against a hostile author is that nothing in a bundle is code
+(no pickle, no custom operator, no reference to another file), that sizes are bounded, and that the graphs may hold
+only allowed operators.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from bot_runtime.golden import read_golden, replay
+from bot_runtime.graph import check_graph
+from bot_runtime.manifest import FILES, FileEntry, Manifest
+from bot_runtime.policy import Cache, Policy
+from protocol.errors import BadBundle
+
+__all__ = ["MANIFEST_FILE", "MAX_FILE_BYTES", "MAX_MANIFEST_BYTES", "Bundle"]
+
+MANIFEST_FILE = "manifest.json"
+MAX_MANIFEST_BYTES = 2**20
+MAX_FILE_BYTES = 256 * 2**20
+_PROBE_BOTS = 3
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """The manifest and the verified bytes of both graphs. Nothing is read from disk after `load`."""
+
+    manifest: Manifest
+    acquisition: bytes
+    action: bytes
+
+    @property
+    def name(self) -> str:
+        """The manifest's name."""
+        return self.manifest.name
+
+    @classmethod
+    def load(cls, path: Path, *, replay: bool = True) -> Bundle:
+        """Read and verify the bundle in directory `path`. Other files there are ignored.
+
+        In this order, each step only on what passed the one before: regular files and not links, sizes, the manifest's
+        schema, sizes and SHA-256 of the three files, operators, the graphs' inputs and outputs, a batch of bots, and
+        (unless `replay` is false) the golden episode. Raises BadBundle naming the file, what was expected and what
+        was found.
+        """
+        manifest = _read_manifest(path / MANIFEST_FILE)
+        contents = {file: _read_verified(path / file, manifest.files[file]) for file in FILES}
+        bundle = cls(manifest, contents["acquisition.onnx"], contents["action.onnx"])
+        check_graph("acquisition.onnx", bundle.acquisition)
+        check_graph("action.onnx", bundle.action)
+        _verify_behaviour(bundle, contents["golden.npz"], with_replay=replay)
+        return bundle
+
+
+def _read_manifest(path: Path) -> Manifest:
+    try:
+        return msgspec.json.decode(_read(path, MAX_MANIFEST_BYTES), type=Manifest)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise BadBundle(f"{path.name}: {error}") from error
+
+
+def _read_verified(path: Path, entry: FileEntry) -> bytes:
+    content = _read(path, MAX_FILE_BYTES)
+    if len(content) != entry.bytes:
+        raise BadBundle(f"{path.name} has {len(content)} bytes, the manifest says {entry.bytes}")
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != entry.sha256:
+        raise BadBundle(f"{path.name} has sha256 {digest}, the manifest says {entry.sha256}")
+    return content
+
+
+def _read(path: Path, limit: int) -> bytes:
+    """The whole content of a regular file. Opening never follows a link at `path` and never waits for a pipe."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise BadBundle(f"{path.name} cannot be opened, expected a regular file: {error.strerror}") from error
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise BadBundle(f"{path.name} is not a regular file")
+        content = file.read(limit + 1)
+    if len(content) > limit:
+        raise BadBundle(f"{path.name} has more than {limit} bytes")
+    return content
+
+
+def _verify_behaviour(bundle: Bundle, golden: bytes, *, with_replay: bool) -> None:
+    recorded = read_golden(golden, bundle.manifest)
+    policy = Policy(bundle)
+    try:
+        _probe_batch(policy, bundle.manifest)
+        if with_replay:
+            replay(policy, bundle.manifest, recorded)
+    except BadBundle:
+        raise
+    except Exception as error:  # onnxruntime raises a dozen unrelated types for a graph that cannot run
+        raise BadBundle(f"the graphs of {bundle.name} do not run: {str(error)[:300]}") from error
+
+
+def _probe_batch(policy: Policy, manifest: Manifest) -> None:
+    """Run several bots at once: the golden episode has one, and exporters like to freeze a batch of one."""
+    table, n_bots = manifest.features, _PROBE_BOTS
+    zeros = {n: np.zeros((n_bots, n), dtype=np.float32) for n in (table.n_free, table.n_costly, manifest.action.size)}
+    returns_to_go_N = np.full(n_bots, manifest.target_return, dtype=np.float32)
+    hidden_NW = np.zeros((n_bots, manifest.width), dtype=np.float32)
+    probs_NM = policy.query_probs(hidden_NW, zeros[table.n_free], returns_to_go_N)
+    head = (manifest.n_layers, n_bots, manifest.n_heads)
+    empty = np.zeros((*head, manifest.n_slots, manifest.head_dim), dtype=np.float32)
+    step = policy.act(
+        zeros[table.n_free],
+        zeros[table.n_costly],
+        np.zeros((n_bots, table.n_queries), dtype=np.bool_),
+        returns_to_go_N,
+        zeros[manifest.action.size],
+        Cache(empty, empty),
+        np.full((n_bots, manifest.n_slots), manifest.context_length, dtype=np.int64),
+    )
+    token = (*head, manifest.head_dim)
+    expected = [(n_bots, table.n_queries), (n_bots, manifest.action.size), (n_bots, manifest.width), token, token]
+    for name, array, shape in zip(("query_probs", *step._fields), (probs_NM, *step), expected, strict=True):
+        if array.shape != shape:
+            raise BadBundle(f"{name} of {n_bots} bots has shape {list(array.shape)}, expected {list(shape)}")

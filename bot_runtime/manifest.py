@@ -1,0 +1,91 @@
+"""What a bundle says about itself: its features, its action, the sizes of its context, and the hash of every file.
+
+This module knows nothing about files on a disk, ONNX or bots.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Literal
+
+import msgspec
+
+from protocol.features import ActionSpec, FeatureTable
+
+__all__ = ["FILES", "MAX_CONTEXT_LENGTH", "MAX_TOLERANCE", "SCHEMA_VERSION", "FileEntry", "Manifest"]
+
+SCHEMA_VERSION = 1
+FILES = ("acquisition.onnx", "action.onnx", "golden.npz")
+MAX_CONTEXT_LENGTH = 1024
+MAX_TOLERANCE = 1e-2
+_MAX_DIMENSION = 65536
+_MAX_CONTEXT_NUMBERS = 16 * 2**20  # keys and values of one bot: 64 MiB
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+class FileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Size in bytes and SHA-256 (lower-case hex) of one file of the bundle."""
+
+    sha256: str
+    bytes: int
+
+    def __post_init__(self) -> None:
+        if not _SHA256.fullmatch(self.sha256):
+            raise ValueError(f"sha256 {self.sha256[:80]!r} is not 64 lower-case hex digits")
+        if self.bytes < 1:
+            raise ValueError(f"a file has {self.bytes} bytes, expected at least 1")
+
+
+class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Schema 1 of `manifest.json`. Raises ValueError (msgspec turns it into ValidationError) when a field is illegal.
+
+    `budget` is the normalised C of the paper, in [0, 1]; 1 means unconstrained. `tolerance` is the largest |Δ| that
+    the golden replay accepts.
+    """
+
+    schema_version: Literal[1]
+    name: str
+    method: Literal["bdt"]
+    features: FeatureTable
+    action: ActionSpec
+    context_length: int
+    n_layers: int
+    n_heads: int
+    head_dim: int
+    width: int
+    target_return: float
+    budget: float
+    tolerance: float
+    files: dict[str, FileEntry]
+    provenance: dict[str, str]
+
+    def __post_init__(self) -> None:
+        if not _NAME.fullmatch(self.name):
+            raise ValueError(f"bundle name {self.name[:80]!r} does not match {_NAME.pattern}")
+        if not 2 <= self.context_length <= MAX_CONTEXT_LENGTH:
+            raise ValueError(f"context_length is {self.context_length}, expected 2 to {MAX_CONTEXT_LENGTH}")
+        for field in ("n_layers", "n_heads", "head_dim", "width"):
+            if not 1 <= getattr(self, field) <= _MAX_DIMENSION:
+                raise ValueError(f"{field} is {getattr(self, field)}, expected 1 to {_MAX_DIMENSION}")
+        if 2 * self.n_layers * self.n_heads * self.n_slots * self.head_dim > _MAX_CONTEXT_NUMBERS:
+            raise ValueError(f"one bot's keys and values are more than {_MAX_CONTEXT_NUMBERS} numbers")
+        if not math.isfinite(self.target_return):
+            raise ValueError(f"target_return is {self.target_return}, expected a finite number")
+        if not 0.0 <= self.budget <= 1.0:
+            raise ValueError(f"budget is {self.budget}, expected 0 to 1")
+        if not 0.0 < self.tolerance <= MAX_TOLERANCE:
+            raise ValueError(f"tolerance is {self.tolerance}, expected more than 0 and at most {MAX_TOLERANCE}")
+        if set(self.files) != set(FILES):
+            raise ValueError(f"files are {sorted(self.files)}, expected {sorted(FILES)}")
+
+    @property
+    def n_slots(self) -> int:
+        """S: how many past turns the key/value cache holds, K - 1."""
+        return self.context_length - 1
+
+    @property
+    def budget_us(self) -> float:
+        """The default budget of one bot in µs, at the costs that the feature table declares."""
+        return self.budget * float(self.features.costs_us.sum())

@@ -1,0 +1,36 @@
+"""Counter-based uniform noise: the same seed, turn and index give the same number on every machine, in any batch.
+
+This module knows nothing about bots or policies. SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom
+number generators", OOPSLA 2014) is used as a hash: a seed selects a stream, a turn a row of it, an index a number.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["mix", "uniforms"]
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX_2 = np.uint64(0x94D049BB133111EB)
+_FLOAT32_STEP = np.float32(2.0**-24)  # 24 bits fill a float32's mantissa, so that no result rounds up to 1
+
+
+def mix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """SplitMix64's output function of each element, any shape."""
+    state = (state ^ (state >> np.uint64(30))) * _MIX_1
+    state = (state ^ (state >> np.uint64(27))) * _MIX_2
+    return state ^ (state >> np.uint64(31))
+
+
+def uniforms(seeds_N: NDArray[np.uint64], turns_N: NDArray[np.int64], count: int) -> NDArray[np.float32]:
+    """`count` numbers in [0, 1) for each bot, shape [N, count]; multiples of 2^-24.
+
+    Row n depends on its own seed and turn only, and a longer row starts with the shorter one.
+    """
+    streams_N = mix(np.asarray(seeds_N, dtype=np.uint64) + _GOLDEN)
+    rows_N = mix(streams_N + np.asarray(turns_N).astype(np.uint64) * _GOLDEN)
+    indices = np.arange(1, count + 1, dtype=np.uint64) * _GOLDEN
+    bits = mix(rows_N[:, None] + indices[None, :])
+    return (bits >> np.uint64(40)).astype(np.float32) * _FLOAT32_STEP
