@@ -94,7 +94,8 @@ class Attention(nn.Module):
         q, k, v = (y.transpose(1, 2) for y in self.project(x_BTW))  # each [B, H, T, h]
         ages_TT = sliding_ages(x_BTW.shape[1], x_BTW.device)
         ages_TT = torch.where((ages_TT >= 0) & (ages_TT < self.context_length), ages_TT, self.context_length)
-        mixed_BHTh = functional.scaled_dot_product_attention(q, k, v, attn_mask=self.bias()[:, ages_TT])
+        bias_HTT = self.bias().index_select(1, ages_TT.flatten()).unflatten(1, ages_TT.shape)
+        mixed_BHTh = functional.scaled_dot_product_attention(q, k, v, attn_mask=bias_HTT)
         return self.out(mixed_BHTh.transpose(1, 2).flatten(2))
 
     def step(
@@ -183,7 +184,7 @@ class BudgetedDecisionTransformer(nn.Module):
 
     def tokens(self, context: Tensor, costly: Tensor, query: Tensor) -> Tensor:
         """x_t = W[q_t∘o_t, q_t, free_t, R_t], shape [..., W]; values that were not acquired cannot enter."""
-        acquired = self.normalise_costly(costly) * query[..., self.owner]
+        acquired = self.normalise_costly(costly) * query.index_select(-1, self.owner)
         return self.encode_token(torch.cat([acquired, query, context], dim=-1))
 
     def trunk(self, x_BTW: Tensor) -> Tensor:
