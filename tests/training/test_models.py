@@ -1,0 +1,90 @@
+"""What the network may and may not depend on, and incremental = windowed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.training.test_acquisition import M, batch, network
+from training.graphs import AcquisitionGraph, ActionGraph
+from training.models import BudgetedDecisionTransformer
+
+
+def hidden_states(model: BudgetedDecisionTransformer, free, costly, togo, query) -> torch.Tensor:
+    return model.trunk(model.tokens(model.context(free, togo), costly, query))
+
+
+def test_unacquired_values_never_matter() -> None:
+    model = network(1)
+    free, costly, togo, uniforms, _ = batch(1, 2, 9)
+    query = (uniforms < 0.5).float()
+    changed = torch.where(query.index_select(-1, model.owner) == 0, costly + 100.0, costly)
+    assert torch.equal(
+        hidden_states(model, free, costly, togo, query), hidden_states(model, free, changed, togo, query)
+    )
+
+
+def test_future_and_current_values_never_change_the_query() -> None:
+    model = network(2)
+    free, costly, togo, _, _ = batch(2, 2, 9)
+    query = torch.ones(2, 9, M)
+    changed = costly.clone()
+    changed[:, 5:] += 10.0
+    context = model.context(free, togo)
+    before = model.query_probs(model.shift(hidden_states(model, free, costly, togo, query)), context)
+    after = model.query_probs(model.shift(hidden_states(model, free, changed, togo, query)), context)
+    assert torch.allclose(before[:, :6], after[:, :6])
+    assert not torch.allclose(before[:, 6:], after[:, 6:])
+
+
+@pytest.mark.parametrize(("context_length", "n_layers"), [(2, 1), (4, 2), (3, 3)])
+def test_a_frame_is_felt_for_exactly_layers_times_span(context_length: int, n_layers: int) -> None:
+    """With span K and L layers an input reaches L(K-1) frames ahead: what must be replayed to rebuild a context."""
+    model = network(3, context_length=context_length, n_layers=n_layers)
+    free, costly, togo, _, _ = batch(3, 1, 14)
+    query = torch.ones(1, 14, M)
+    changed = costly.clone()
+    changed[:, 0] += 3.0
+    difference = hidden_states(model, free, costly, togo, query) - hidden_states(model, free, changed, togo, query)
+    felt = difference.abs().amax((0, 2)) > 1e-6
+    reach = n_layers * (context_length - 1)
+    assert felt[: reach + 1].all()
+    assert not felt[reach + 1 :].any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_incremental_equals_windowed_over_an_episode_longer_than_the_span(seed: int) -> None:
+    model = network(seed)
+    config, length, n = model.config, 23, 2
+    slots, head = config.context_length - 1, config.width // config.n_heads
+    free, costly, togo, uniforms, _ = batch(seed, n, length)
+    query = (uniforms < 0.5).float()
+    windowed = hidden_states(model, free, costly, togo, query)
+    probs = model.query_probs(model.shift(windowed), model.context(free, togo))
+    keys = torch.zeros(config.n_layers, n, config.n_heads, slots, head)
+    values = torch.full_like(keys, 9.0)  # an empty slot's contents must not matter
+    ages = torch.full((n, slots), config.context_length)
+    hidden = torch.zeros(n, config.width)
+    noise = torch.rand(n, length, 2)
+    acquisition, action = AcquisitionGraph(model), ActionGraph(model)
+    for t in range(length):
+        assert torch.allclose(acquisition(hidden, free[:, t], togo[:, t]), probs[:, t], atol=1e-5)
+        actions, hidden, new_keys, new_values = action(
+            free[:, t], costly[:, t], query[:, t], togo[:, t], noise[:, t], keys, values, ages
+        )
+        assert torch.allclose(hidden, windowed[:, t], atol=1e-5)
+        assert torch.allclose(actions, model.actions(windowed[:, t], noise[:, t]))
+        slot = t % slots
+        keys[:, :, :, slot], values[:, :, :, slot] = new_keys, new_values
+        ages = (ages + 1).clamp(max=config.context_length)
+        ages[:, slot] = 1
+
+
+def test_sampled_component_follows_its_probabilities() -> None:
+    model = network(0)
+    hidden = torch.randn(1, 8)
+    noise = torch.linspace(0, 0.9999, 2000)[:, None].expand(-1, 2)
+    actions = model.actions(hidden.expand(2000, -1), noise)
+    expected = torch.softmax(model.action_logits(hidden)[1], -1)[0, 1].item()
+    assert actions[:, 1].mean().item() == pytest.approx(expected, abs=2e-3)
+    assert actions[:, 0].unique().numel() == 1

@@ -1,0 +1,65 @@
+"""The objective against oracles of a few lines, written from the paper."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from training.objectives import action_loss, nearest_bins, penalty, penalty_weight, query_cost, straight_through
+
+bits = st.lists(st.integers(0, 1), min_size=3, max_size=3)
+
+
+@given(st.lists(bits, min_size=1, max_size=6), st.floats(0, 1), st.lists(st.floats(0.1, 9), min_size=3, max_size=3))
+def test_penalty_is_equation_2(queries: list[list[int]], budget: float, costs: list[float]) -> None:
+    query = torch.tensor([queries], dtype=torch.float64)
+    cost = query_cost(query, torch.tensor(costs, dtype=torch.float64))
+    expected = [sum(q * f for q, f in zip(row, costs, strict=True)) / sum(costs) for row in queries]
+    assert cost[0].tolist() == pytest.approx(expected)
+    phi = penalty(cost, budget, torch.ones(1, len(queries)))
+    assert phi.item() == pytest.approx(sum(max(c - budget, 0) for c in expected) / len(queries))
+
+
+def test_padding_changes_neither_loss_nor_penalty() -> None:
+    logits, bins = torch.randn(2, 5, 4), torch.randint(0, 4, (2, 5, 1))
+    valid = torch.tensor([[1, 1, 1, 0, 0], [1, 1, 1, 1, 1.0]])
+    cost = torch.rand(2, 5)
+    other_logits, other_bins, other_cost = logits.clone(), bins.clone(), cost.clone()
+    other_logits[0, 3:] += 100
+    other_bins[0, 3:] = 0
+    other_cost[0, 3:] = 1
+    assert torch.equal(action_loss([logits], bins, valid), action_loss([other_logits], other_bins, valid))
+    assert torch.equal(penalty(cost, 0.3, valid), penalty(other_cost, 0.3, valid))
+
+
+def test_action_loss_sums_components_and_averages_timesteps() -> None:
+    logits = [torch.zeros(1, 2, 4), torch.zeros(1, 2, 2)]
+    loss = action_loss(logits, torch.zeros(1, 2, 2, dtype=torch.long), torch.ones(1, 2))
+    assert loss.item() == pytest.approx(math.log(4) + math.log(2))
+
+
+def test_straight_through_is_the_sample_in_value_and_the_probability_in_gradient() -> None:
+    probs = torch.tensor([0.2, 0.7], requires_grad=True)
+    query = straight_through(torch.tensor([1.0, 0.0]), probs)
+    assert query.tolist() == pytest.approx([1.0, 0.0])
+    (query * torch.tensor([3.0, 5.0])).sum().backward()
+    assert probs.grad is not None
+    assert probs.grad.tolist() == [3.0, 5.0]
+
+
+@given(st.lists(st.floats(0, 1), max_size=30), st.floats(1e-4, 1))
+def test_penalty_weight_never_falls_and_counts_violations(phis: list[float], step: float) -> None:
+    weight = 0.0
+    for phi in phis:
+        before, weight = weight, penalty_weight(weight, phi, step)
+        assert weight == (before + step if phi > 0 else before)
+    assert weight == pytest.approx(step * sum(phi > 0 for phi in phis))
+
+
+def test_nearest_bins_at_and_beyond_the_edges() -> None:
+    actions = torch.tensor([[-1.0, 0.0], [1.0, 1.0], [0.09, 0.51], [7.0, -3.0]])
+    assert nearest_bins(actions, (-1.0, 0.0), (1.0, 1.0), (11, 2)).tolist() == [[0, 0], [10, 1], [5, 1], [10, 0]]
