@@ -62,25 +62,46 @@ class Grid:
         return column - self.half_x - 0.5, row - self.half_y - 0.5
 
     def cost_to_go(self, costs: list[float], target: int, start: int, slack: float = 8.0) -> list[float]:
-        """Least effort from each cell to `target` (Dijkstra), exact at least to `slack` beyond the effort of `start`."""
+        """Least effort from each cell to `target`, `inf` where not looked at.
+
+        A*, from the target towards `start`: exact on every cell through which the way from `start` is at most `slack`
+        longer than the best. Every cost must be at least 1, or the heuristic lies.
+        """
         best = [math.inf] * len(costs)
         best[target] = 0.0
-        heap = [(0.0, target)]
-        limit = math.inf
+        rest = self._octile(start)
+        heap = [(rest[target], 0.0, target)]
+        limit, inf, half_diagonal = math.inf, math.inf, 0.5 * _DIAGONAL
         while heap:
-            effort, cell = heapq.heappop(heap)
+            total, effort, cell = heapq.heappop(heap)
             if effort > best[cell]:
                 continue
-            if effort > limit:
+            if total > limit:
                 break
             if cell == start:
                 limit = effort + slack
-            for neighbour, length in self._neighbours(costs, cell):
-                onward = effort + length * 0.5 * (costs[cell] + costs[neighbour])
+            own = costs[cell]
+            for step in self._straight:
+                neighbour = cell + step
+                onward = effort + 0.5 * (own + costs[neighbour])
                 if onward < best[neighbour]:
                     best[neighbour] = onward
-                    heapq.heappush(heap, (onward, neighbour))
+                    heapq.heappush(heap, (onward + rest[neighbour], onward, neighbour))
+            for step, side_a, side_b in self._diagonal:
+                neighbour = cell + step
+                onward = effort + half_diagonal * (own + costs[neighbour])
+                if onward < best[neighbour] and costs[cell + side_a] < inf and costs[cell + side_b] < inf:
+                    best[neighbour] = onward
+                    heapq.heappush(heap, (onward + rest[neighbour], onward, neighbour))
         return best
+
+    def _octile(self, cell: int) -> list[float]:
+        """Least possible distance of every cell to one, walking straight and diagonally."""
+        x, y = self.centre(cell)
+        dx_HW, dy_HW = np.abs(self._x_HW - x), np.abs(self._y_HW - y)
+        octile_HW = np.maximum(dx_HW, dy_HW) + (_DIAGONAL - 1.0) * np.minimum(dx_HW, dy_HW)
+        octile: list[float] = octile_HW.ravel().tolist()
+        return octile
 
     def descend(self, costs: list[float], efforts: list[float], cell: int) -> int:
         """The neighbour through which the least effort leads, or the cell itself where none is better."""

@@ -18,6 +18,7 @@ __all__ = ["Layout", "draw_layout", "open_stretches"]
 _DRAWS = 200
 _CLEAR_OF_TRIP_M = 3.0
 _BETWEEN_POOLS_M = 3.0
+_BESIDE_BLOCK_M = 1.0
 _SAFE_M = 0.9
 
 
@@ -74,11 +75,14 @@ def _draw(terrain: Terrain, rng: np.random.Generator) -> Layout | None:
         standing = rng.choice(len(river.slots), size=river.standing, replace=False)
         bridges.append(tuple(bool(slot in standing) for slot in range(len(river.slots))))
     pools: list[Hazard] = []
+    blocks = [block.rect for block in (*terrain.walls, *terrain.ledges)]
     for zone in terrain.pools:
         for _ in range(zone.count):
             pool = _pool(zone, rng)
             if any(overlaps(pool.rect, other.rect, _BETWEEN_POOLS_M) for other in pools):
                 continue  # fewer pools rather than a wall of them
+            if any(overlaps(pool.rect, block, _BESIDE_BLOCK_M) for block in blocks):
+                continue  # nobody sees what lies half under a wall
             if any(_near(pool.rect, point, _CLEAR_OF_TRIP_M) for point in (start, goal)):
                 continue
             pools.append(pool)
@@ -107,7 +111,7 @@ def _near(rect: Rect, point: tuple[float, float], margin_m: float) -> bool:
 
 def _reachable(terrain: Terrain, grid: Grid, layout: Layout) -> bool:
     costs_HW = grid.empty()
-    costs_HW[grid.inside((wall.rect for wall in terrain.walls))] = np.inf
+    costs_HW[grid.inside(wall.rect for wall in terrain.walls)] = np.inf
     costs_HW[grid.inside(layout.deadly, _SAFE_M)] = np.inf
     costs: list[float] = costs_HW.ravel().tolist()
     start, goal = grid.cell(*layout.start), grid.cell(*layout.goal)

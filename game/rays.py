@@ -14,11 +14,10 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from game.character import EYE_M
-from protocol.features import CostModel, Feature, FeatureTable
+from protocol.features import CostModel, Feature
 
 __all__ = [
     "CLASSES",
@@ -81,7 +80,7 @@ class RayCosts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load_costs(name_or_path: str = "godot") -> RayCosts:
-    """A preset (`godot`: the paper's table; `pybullet`: measured here) or a JSON file; ValueError if it lacks a range."""
+    """A preset (`godot`: the paper's, `pybullet`: measured) or a JSON file; ValueError if a range is missing."""
     path = Path(name_or_path)
     text = (
         path.read_bytes() if path.suffix == ".json" else (files("game") / "costs" / f"{name_or_path}.json").read_bytes()
