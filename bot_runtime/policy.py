@@ -41,6 +41,13 @@ class Step(NamedTuple):
     new_keys: Floats
     new_values: Floats
 
+    @property
+    def finite_N(self) -> NDArray[np.bool_]:
+        """Which bots' numbers are all finite, shape [N]: one NaN in a cache would spoil a bot for good."""
+        tokens = np.isfinite(self.new_keys) & np.isfinite(self.new_values)  # [L, N, H, d]
+        outputs = np.isfinite(self.action_NA).all(axis=1) & np.isfinite(self.hidden_NW).all(axis=1)
+        return np.logical_and(outputs, tokens.all(axis=(0, 2, 3)))
+
 
 class Policy:
     """Two onnxruntime sessions. Raises BadBundle when a graph does not load or its ports are not the manifest's.

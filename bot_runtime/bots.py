@@ -1,0 +1,252 @@
+"""Bots: the only stateful façade. Start bots, ask what each should acquire, submit it and get actions, stop bots.
+
+This module knows nothing about bytes, sockets, connections or time (but for the injected clock that measures
+inference). It is not thread-safe: one worker owns it.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bot_runtime import inputs
+from bot_runtime.budget import allocate
+from bot_runtime.bundle import Bundle
+from bot_runtime.context import Contexts
+from bot_runtime.fallback import Counters, fallback_actions
+from bot_runtime.noise import uniforms
+from bot_runtime.policy import Policy, Step
+from bot_runtime.slots import Slots
+from bot_runtime.turns import Actions, Queries, Turn, Turns
+from protocol.errors import BadSchema, FrameReused
+from protocol.features import CostModel
+
+__all__ = ["Bots"]
+
+_MAX_BUDGET_US = 1e9
+_Handles = NDArray[np.int64]
+
+
+class Bots:
+    """All bots of one bundle in one process. A batch of N bots is the native shape; one bot is N = 1.
+
+    Every refused call (any ProtocolError) leaves every bot exactly as it was. A repeated request with the same content
+    gets the same reply object again and advances nothing; replies are read-only arrays. `counters` says how often
+    each rung of the fallback ladder was used.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        *,
+        max_bots: int = 256,
+        clock: Callable[[], int] = time.perf_counter_ns,
+        first_generation: int | None = None,
+    ) -> None:
+        """`clock` counts ns. `first_generation` of the handles are random by default: none outlives a process."""
+        self.bundle = bundle
+        self.counters = Counters()
+        self._clock = clock
+        self._policy = Policy(bundle)
+        generation = secrets.randbits(31) if first_generation is None else first_generation
+        self._slots = Slots(max_bots, first_generation=generation)
+        self._contexts = Contexts(bundle.manifest, max_bots)
+        self._turns = Turns(max_bots, self.counters)
+        self._costs_BM = np.zeros((max_bots, bundle.manifest.features.n_queries))
+        self._calls_B = np.zeros(max_bots)
+        self._budgets_B = np.zeros(max_bots)
+        self._started = 0
+        components = bundle.manifest.action.components
+        self._low_A = np.array([component.low for component in components], dtype=np.float32)
+        self._high_A = np.array([component.high for component in components], dtype=np.float32)
+
+    @property
+    def n_bots(self) -> int:
+        """How many bots there are."""
+        return self._slots.n_live
+
+    @property
+    def max_bots(self) -> int:
+        """How many bots fit."""
+        return self._slots.capacity
+
+    def start(
+        self,
+        count: int,
+        *,
+        seeds: Sequence[int] | NDArray[np.uint64] | None = None,
+        target_returns: Sequence[float] | NDArray[np.float64] | None = None,
+        budgets_us: Sequence[float] | NDArray[np.float64] | None = None,
+        cost_model: CostModel | None = None,
+    ) -> _Handles:
+        """Start bots and return their handles, int64 [count].
+
+        Defaults: the n-th bot started here has seed n; the bundle's target return and budget (none at all when that
+        is the full cost); the costs that the feature table declares. Raises BadSchema, BadShape, NonFinite,
+        OutOfRange, TooManyBots.
+        """
+        if count < 1:
+            raise BadSchema(f"count is {count}, expected at least 1")
+        manifest, limit = self.bundle.manifest, inputs.MAX_RETURN
+        model = cost_model or CostModel.declared(manifest.features)
+        inputs.check_costs(model, manifest.features)
+        default_us = np.inf if manifest.budget == 1.0 else manifest.budget_us
+        targets_N, budgets_N = np.full(count, manifest.target_return), np.full(count, default_us)
+        if target_returns is not None:
+            targets_N = inputs.per_bot("target_returns", target_returns, count, -limit, limit)
+        if budgets_us is not None:
+            budgets_N = inputs.per_bot("budgets_us", budgets_us, count, 0.0, _MAX_BUDGET_US)
+        numbered = range(self._started, self._started + count)
+        seeds_N = inputs.seeds(numbered if seeds is None else seeds, count)
+        slots_N = self._slots.take(count)
+        self._started += count
+        self._contexts.begin(slots_N, seeds_N, targets_N)
+        self._costs_BM[slots_N] = model.costs_us
+        self._calls_B[slots_N] = model.call_us
+        self._budgets_B[slots_N] = budgets_N
+        return self._slots.handles(slots_N)
+
+    def request_queries(
+        self,
+        handles: _Handles,
+        frame: int,
+        free_NF: NDArray[np.float32],
+        rewards_N: Sequence[float] | NDArray[np.floating] | None = None,
+        frame_budget_us: float | None = None,
+    ) -> Queries:
+        """What each bot asks for in this frame, within its own budget and, together, within `frame_budget_us`.
+
+        `rewards_N` came since each bot's last frame and leave its return-to-go, once. A newer frame abandons a
+        pending query. Raises BadShape, BadSchema, NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
+        """
+        slots_N = self._slots.resolve(handles)
+        inputs.check_frame(frame)
+        retried = self._turns.query(handles, slots_N, frame)
+        inputs.check_free(free_NF, handles, self.bundle.manifest.features)
+        limit = inputs.MAX_RETURN
+        rewards_N = np.zeros(handles.size) if rewards_N is None else rewards_N
+        rewards_N = inputs.per_bot("rewards", rewards_N, handles.size, -limit, limit)
+        shared = () if frame_budget_us is None else (frame_budget_us,)
+        shared_us = inputs.per_bot("frame_budget_us", shared, len(shared), 0.0, _MAX_BUDGET_US)
+        request = (free_NF.copy(), rewards_N, shared_us)
+        if retried is not None:
+            _check_same(request, retried.request, frame)
+            return retried.queries
+        returns_to_go_N = self._contexts.returns_to_go(slots_N) - rewards_N
+        turn = self._ask(handles, slots_N, frame, request, returns_to_go_N.astype(np.float32), frame_budget_us)
+        self._contexts.spend(slots_N, returns_to_go_N)
+        self._turns.begin(slots_N, turn)
+        return turn.queries
+
+    def submit_features(
+        self,
+        handles: _Handles,
+        frame: int,
+        acquired_NM: NDArray[np.bool_],
+        costly_ND: NDArray[np.float32],
+        failed_NM: NDArray[np.bool_] | None = None,
+    ) -> Actions:
+        """Answer the pending query of exactly these bots, in its order, and get their actions.
+
+        `costly_ND` is dense; numbers of features that were not acquired, or are marked failed, are never looked at.
+        Raises BadShape, BadSchema, NoBot, StaleFrame, NoPendingQuery, UnrequestedFeature, MissingFeature, NonFinite,
+        OutOfRange, FrameReused.
+        """
+        slots_N = self._slots.resolve(handles)
+        inputs.check_frame(frame)
+        turn = self._turns.features(handles, slots_N, frame)
+        table, query_NM = self.bundle.manifest.features, turn.queries.query_NM
+        acquired_NM, known_ND = inputs.check_features(acquired_NM, costly_ND, failed_NM, query_NM, handles, table)
+        submission = (acquired_NM, known_ND)
+        if turn.actions is not None:
+            _check_same(submission, turn.submission, frame)
+            return turn.actions
+        actions = self._act(turn, slots_N, acquired_NM, known_ND)
+        turn.submission, turn.actions = submission, actions
+        return actions
+
+    def stop(self, handles: _Handles) -> int:
+        """End these bots and zero all that is kept of them; how many. Raises BadShape, BadSchema, NoBot.
+
+        A query pending for them and for others can no longer be answered; the others go on with their next frame.
+        """
+        slots_N = self._slots.resolve(handles)
+        self._turns.leave(slots_N)
+        self._contexts.clear(slots_N)
+        for array in (self._costs_BM, self._calls_B, self._budgets_B):
+            array[slots_N] = 0.0
+        self._slots.release(slots_N)
+        return int(slots_N.size)
+
+    def _ask(
+        self,
+        handles: _Handles,
+        slots_N: NDArray[np.int64],
+        frame: int,
+        request: tuple[NDArray[np.generic], ...],
+        returns_to_go_N: NDArray[np.float32],
+        frame_budget_us: float | None,
+    ) -> Turn:
+        """Compute a turn's first half without changing any bot."""
+        manifest, free_NF = self.bundle.manifest, request[0].astype(np.float32, copy=False)
+        n_queries = manifest.features.n_queries
+        started_ns = self._clock()
+        probs_NM = self._policy.query_probs(self._contexts.hidden(slots_N), free_NF, returns_to_go_N)
+        infer_us = (self._clock() - started_ns) / 1e3
+        asks_N1 = np.isfinite(probs_NM).all(axis=1, keepdims=True)
+        seeds_N, turns_N = self._contexts.seeds(slots_N), self._contexts.turns(slots_N)
+        noise = uniforms(seeds_N, turns_N, n_queries + manifest.action.size)
+        sampled_NM = (noise[:, :n_queries] < probs_NM) & asks_N1
+        costs_NM, calls_N = self._costs_BM[slots_N], self._calls_B[slots_N]
+        query_NM = allocate(probs_NM, sampled_NM, costs_NM, calls_N, self._budgets_B[slots_N], frame_budget_us)
+        cost_us_N = np.where(query_NM, costs_NM, 0.0).sum(axis=1) + np.where(query_NM.any(axis=1), calls_N, 0.0)
+        _freeze(query_NM, cost_us_N, probs_NM)
+        queries = Queries(frame, query_NM, cost_us_N, probs_NM, infer_us)
+        return Turn(frame, handles.copy(), request, free_NF, queries, returns_to_go_N, noise[:, n_queries:], no_query_N)
+
+    def _act(
+        self,
+        turn: Turn,
+        slots_N: NDArray[np.int64],
+        acquired_NM: NDArray[np.bool_],
+        costly_ND: NDArray[np.float32],
+    ) -> Actions:
+        """A turn's second half: act, then advance the contexts of those bots whose step is finite."""
+        contexts = self._contexts
+        cache, ages_NS = contexts.cache(slots_N), contexts.ages(slots_N)
+        started_ns = self._clock()
+        step = self._policy.act(
+            turn.free_NF, costly_ND, acquired_NM, turn.returns_to_go_N, turn.noise_NA, cache, ages_NS
+        )
+        infer_us = (self._clock() - started_ns) / 1e3
+        usable_N = step.finite_N
+        # A Gaussian head may overshoot; what leaves is within the action that the bundle declares.
+        learned_NA = np.clip(step.action_NA, self._low_A, self._high_A)
+        action_NA, reasons_N = fallback_actions(
+            learned_NA,
+            usable_N,
+            turn.no_query_N,
+            contexts.last_action(slots_N),
+            contexts.turns(slots_N) > 0,
+            self.bundle.manifest.action.safe,
+        )
+        kept = slice(None) if usable_N.all() else usable_N
+        taken = Step(action_NA[kept], step.hidden_NW[kept], step.new_keys[:, kept], step.new_values[:, kept])
+        contexts.advance(slots_N[kept], taken)
+        self.counters.count(reasons_N)
+        _freeze(action_NA, reasons_N)
+        return Actions(turn.frame, action_NA, reasons_N, infer_us)
+
+
+def _check_same(content: tuple[NDArray[np.generic], ...], kept: tuple[NDArray[np.generic], ...], frame: int) -> None:
+    if not all(np.array_equal(new, old) for new, old in zip(content, kept, strict=True)):
+        raise FrameReused(f"frame {frame} was sent before with other content")
+
+
+def _freeze(*arrays: NDArray[np.generic]) -> None:
+    for array in arrays:
+        array.flags.writeable = False

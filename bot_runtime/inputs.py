@@ -1,0 +1,136 @@
+"""What an engine sends, checked: shapes, finite numbers, declared ranges, and features that were asked for.
+
+This module knows nothing about contexts, turns or policies. Nothing is ever clipped or repaired: a value is legal, or
+its request is refused with the bot, the feature, what was expected and what came.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.errors import BadSchema, BadShape, MissingFeature, NonFinite, OutOfRange, UnrequestedFeature
+from protocol.features import CostModel, Feature, FeatureTable
+from protocol.messages import MAX_FRAME
+
+__all__ = ["MAX_RETURN", "check_costs", "check_features", "check_frame", "check_free", "per_bot", "seeds"]
+
+MAX_RETURN = 1e9  # of one reward or target return: float32 holds sums of very many
+_MAX_SEED = 2**64 - 1
+
+_Floats = NDArray[np.float32]
+_Bools = NDArray[np.bool_]
+
+
+def check_frame(frame: int) -> None:
+    """Raises BadSchema unless `frame` is within 0 to 2^53."""
+    if not 0 <= frame <= MAX_FRAME:
+        raise BadSchema(f"frame is {frame}, expected 0 to {MAX_FRAME}")
+
+
+def check_costs(model: CostModel, table: FeatureTable) -> None:
+    """Raises BadShape unless the cost model prices exactly the table's costly features."""
+    if len(model.feature_us) != table.n_queries:
+        raise BadShape(f"cost_model.feature_us has {len(model.feature_us)} costs, expected {table.n_queries}")
+
+
+def per_bot(
+    name: str, numbers: Sequence[float] | NDArray[np.floating] | float, n_bots: int, low: float, high: float
+) -> NDArray[np.float64]:
+    """One number a bot, shape [N]. Raises BadShape, NonFinite, OutOfRange (outside `low` to `high`)."""
+    numbers_N = np.array(numbers, dtype=np.float64)
+    if numbers_N.shape != (n_bots,):
+        raise BadShape(f"{name} has shape {list(numbers_N.shape)}, expected [{n_bots}], one number a bot")
+    if not np.isfinite(numbers_N).all():
+        row = int(np.argmin(np.isfinite(numbers_N)))
+        raise NonFinite(f"{name} of bot {row} of the message is {numbers_N[row]}, expected a finite number")
+    legal_N = (numbers_N >= low) & (numbers_N <= high)
+    if not legal_N.all():
+        row = int(np.argmin(legal_N))
+        raise OutOfRange(f"{name} of bot {row} of the message is {numbers_N[row]}, expected {low:g} to {high:g}")
+    return numbers_N
+
+
+def seeds(numbers: Sequence[int] | NDArray[np.integer], n_bots: int) -> NDArray[np.uint64]:
+    """One seed a bot, shape [N]. Raises BadShape, OutOfRange (outside 0 to 2^64 - 1)."""
+    if len(numbers) != n_bots:
+        raise BadShape(f"seeds has {len(numbers)} numbers, expected {n_bots}, one a bot")
+    for row, seed in enumerate(numbers):
+        if not 0 <= seed <= _MAX_SEED:
+            raise OutOfRange(f"seed of bot {row} of the message is {seed}, expected 0 to {_MAX_SEED}")
+    return np.array([int(seed) for seed in numbers], dtype=np.uint64)
+
+
+def check_free(free_NF: _Floats, handles_N: NDArray[np.int64], table: FeatureTable) -> None:
+    """Raises BadShape, NonFinite or OutOfRange unless these are legal free numbers of these bots."""
+    _check_shape("free", free_NF, (handles_N.size, table.n_free), np.dtype(np.float32))
+    _check_values(free_NF, None, handles_N, table.free, table.free_range)
+
+
+def check_features(
+    acquired_NM: _Bools,
+    costly_ND: _Floats,
+    failed_NM: _Bools | None,
+    query_NM: _Bools,
+    handles_N: NDArray[np.int64],
+    table: FeatureTable,
+) -> tuple[_Bools, _Floats]:
+    """What was really acquired [N, M] (a failed feature was not), and its values [N, D], zero where not acquired.
+
+    Raises BadShape; UnrequestedFeature for anything beyond the query; MissingFeature where the query is not covered;
+    NonFinite and OutOfRange for acquired values. Other values are never looked at.
+    """
+    bits, numbers = (handles_N.size, table.n_queries), (handles_N.size, table.n_costly)
+    _check_shape("acquired", acquired_NM, bits, np.dtype(np.bool_))
+    _check_shape("values", costly_ND, numbers, np.dtype(np.float32))
+    if failed_NM is None:
+        failed_NM = np.zeros(bits, dtype=np.bool_)
+    _check_shape("failed", failed_NM, bits, np.dtype(np.bool_))
+    unrequested_NM = (acquired_NM | failed_NM) & ~query_NM
+    if unrequested_NM.any():
+        bot, feature = _first(unrequested_NM, handles_N, table.costly)
+        raise UnrequestedFeature(f"{feature} of bot {bot} came or failed, but was not asked for")
+    missing_NM = query_NM & ~acquired_NM & ~failed_NM
+    if missing_NM.any():
+        bot, feature = _first(missing_NM, handles_N, table.costly)
+        raise MissingFeature(f"{feature} of bot {bot} was asked for, and neither came nor is marked failed")
+    acquired_NM = acquired_NM & ~failed_NM
+    known_ND = acquired_NM[:, table.owner]
+    _check_values(costly_ND, known_ND, handles_N, table.costly, table.costly_range)
+    return acquired_NM, np.where(known_ND, costly_ND, np.float32(0.0))
+
+
+def _check_shape(name: str, array: NDArray[np.generic], shape: tuple[int, int], dtype: np.dtype[np.generic]) -> None:
+    if array.shape != shape or array.dtype != dtype:
+        got = f"{array.dtype} {list(array.shape)}"
+        raise BadShape(f"{name} is {got}, expected {dtype} {list(shape)}, one row a bot")
+
+
+def _check_values(
+    values: _Floats,
+    known: _Bools | None,
+    handles_N: NDArray[np.int64],
+    features: tuple[Feature, ...],
+    limits: tuple[_Floats, _Floats],
+) -> None:
+    """Each is [N, numbers]; where `known` is given, only those numbers count."""
+    legal = (values >= limits[0]) & (values <= limits[1])  # false for NaN
+    if known is not None:
+        legal |= ~known
+    if legal.all():
+        return
+    finite = np.isfinite(values) if known is None else np.isfinite(values) | ~known
+    bad = ~(legal if finite.all() else finite)
+    row, column = (int(index) for index in np.argwhere(bad)[0])
+    owner = int(np.repeat(np.arange(len(features)), [feature.size for feature in features])[column])
+    feature, where = features[owner], f"of bot {handles_N[row]} is {values[row, column]}"
+    if not finite.all():
+        raise NonFinite(f"{feature.name} {where}, expected a finite number")
+    raise OutOfRange(f"{feature.name} {where}, expected {feature.low:g} to {feature.high:g}")
+
+
+def _first(bits_NM: _Bools, handles_N: NDArray[np.int64], costly: tuple[Feature, ...]) -> tuple[int, str]:
+    row, column = (int(index) for index in np.argwhere(bits_NM)[0])
+    return int(handles_N[row]), costly[column].name

@@ -1,0 +1,135 @@
+"""The turns in progress: which frame each bot saw last, what was asked and answered then, and retries.
+
+This module knows nothing about policies, budgets or contexts. What may follow what is `protocol.turn`'s table; this
+module applies it to the bots of one message at once and keeps what a retry has to repeat.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bot_runtime.fallback import Counters
+from protocol.errors import FrameReused, NoPendingQuery
+from protocol.turn import Event, Phase, is_retry, transition
+
+__all__ = ["Actions", "Queries", "Turn", "Turns"]
+
+_NONE = 0  # the turn id of a bot that has had no turn
+Slots = NDArray[np.int64]
+
+
+class Queries(NamedTuple):
+    """What each bot asks for, its predicted cost in µs, the Bernoulli means it was drawn from, and µs of inference."""
+
+    frame: int
+    query_NM: NDArray[np.bool_]
+    cost_us_N: NDArray[np.float64]
+    probs_NM: NDArray[np.float32]
+    infer_us: float
+
+
+class Actions(NamedTuple):
+    """What each bot does, why (`bot_runtime.fallback.Reason`), and µs of inference."""
+
+    frame: int
+    action_NA: NDArray[np.float32]
+    reasons_N: NDArray[np.uint8]
+    infer_us: float
+
+
+@dataclass
+class Turn:
+    """One message's bots in one frame: what came, what was answered, and what the second half needs of the first."""
+
+    frame: int
+    handles_N: NDArray[np.int64]
+    request: tuple[NDArray[np.generic], ...]  # what a retry must equal
+    free_NF: NDArray[np.float32]
+    queries: Queries
+    returns_to_go_N: NDArray[np.float32]
+    noise_NA: NDArray[np.float32]
+    no_query_N: NDArray[np.bool_]
+    submission: tuple[NDArray[np.generic], ...] = ()
+    actions: Actions | None = None
+
+    @property
+    def phase(self) -> Phase:
+        """Where its bots are, as long as it is their last turn."""
+        return Phase.PENDING if self.actions is None else Phase.ANSWERED
+
+
+class Turns:
+    """The last turn of every slot. Bots of one message share a turn, and it is dropped when its last bot leaves it."""
+
+    def __init__(self, capacity: int, counters: Counters) -> None:
+        self._turn_of_B = np.full(capacity, _NONE, dtype=np.int64)
+        self._turns: dict[int, Turn] = {}
+        self._members: dict[int, int] = {}
+        self._next_id = _NONE + 1
+        self._counters = counters
+
+    def query(self, handles_N: NDArray[np.int64], slots_N: Slots, frame: int) -> Turn | None:
+        """The turn that this request repeats, or None when it is a new one; changes nothing.
+
+        Raises StaleFrame; FrameReused when any of these bots saw this frame in other company.
+        """
+        repeats = False
+        for turn in self._distinct(slots_N):
+            phase, last_frame = (turn.phase, turn.frame) if turn else (Phase.IDLE, None)
+            transition(phase, last_frame, Event.QUERY, frame)
+            repeats |= is_retry(phase, last_frame, Event.QUERY, frame)
+        if not repeats:
+            return None
+        turn = self._turns.get(int(self._turn_of_B[slots_N[0]]))
+        if turn is None or not np.array_equal(turn.handles_N, handles_N):
+            raise FrameReused(f"frame {frame} was requested before with other bots, or in another order")
+        return turn
+
+    def features(self, handles_N: NDArray[np.int64], slots_N: Slots, frame: int) -> Turn:
+        """The turn that these features answer (again, if its actions are known); changes nothing.
+
+        Raises StaleFrame and NoPendingQuery, the latter also unless the bots are exactly the query's, in its order.
+        """
+        turns = self._distinct(slots_N)
+        for turn in turns:
+            phase, last_frame = (turn.phase, turn.frame) if turn else (Phase.IDLE, None)
+            transition(phase, last_frame, Event.FEATURES, frame)
+        turn = turns[0]
+        if turn is None or len(turns) > 1 or not np.array_equal(turn.handles_N, handles_N):
+            raise NoPendingQuery(f"no query of frame {frame} is pending for exactly these bots in this order")
+        return turn
+
+    def begin(self, slots_N: Slots, turn: Turn) -> None:
+        """Make `turn` the last one of these slots; their pending queries are abandoned."""
+        for old, n_bots in self._leave(slots_N):
+            self._counters.skipped_frames += n_bots * (turn.frame - old.frame - 1)
+            self._counters.abandoned_queries += n_bots if old.phase is Phase.PENDING else 0
+        self._turn_of_B[slots_N] = self._next_id
+        self._turns[self._next_id] = turn
+        self._members[self._next_id] = slots_N.size
+        self._next_id += 1
+
+    def leave(self, slots_N: Slots) -> None:
+        """Forget the last turn of these slots."""
+        self._leave(slots_N)
+
+    def _leave(self, slots_N: Slots) -> list[tuple[Turn, int]]:
+        left: list[tuple[Turn, int]] = []
+        ids, counts = np.unique(self._turn_of_B[slots_N], return_counts=True)
+        self._turn_of_B[slots_N] = _NONE
+        for key, count in zip(ids.tolist(), counts.tolist(), strict=True):
+            if key != _NONE:
+                left.append((self._turns[key], count))
+                self._members[key] -= count
+                if self._members[key] == 0:
+                    del self._members[key], self._turns[key]
+        return left
+
+    def _distinct(self, slots_N: Slots) -> list[Turn | None]:
+        ids_N = self._turn_of_B[slots_N]
+        same = bool((ids_N == ids_N[0]).all())
+        return [self._turns.get(key) for key in (ids_N[:1] if same else np.unique(ids_N)).tolist()]
