@@ -197,23 +197,19 @@ class Bots:
         started_ns = self._clock()
         probs_NM = self._policy.query_probs(self._contexts.hidden(slots_N), free_NF, returns_to_go_N)
         infer_us = (self._clock() - started_ns) / 1e3
-        asks_N1 = np.isfinite(probs_NM).all(axis=1, keepdims=True)
+        asks_N = np.logical_and.reduce(np.isfinite(probs_NM), axis=1)
         seeds_N, turns_N = self._contexts.seeds(slots_N), self._contexts.turns(slots_N)
         noise = uniforms(seeds_N, turns_N, n_queries + manifest.action.size)
-        sampled_NM = (noise[:, :n_queries] < probs_NM) & asks_N1
+        sampled_NM = (noise[:, :n_queries] < probs_NM) & asks_N[:, None]
         costs_NM, calls_N = self._costs_BM[slots_N], self._calls_B[slots_N]
         query_NM = allocate(probs_NM, sampled_NM, costs_NM, calls_N, self._budgets_B[slots_N], frame_budget_us)
         cost_us_N = np.where(query_NM, costs_NM, 0.0).sum(axis=1) + np.where(query_NM.any(axis=1), calls_N, 0.0)
         _freeze(query_NM, cost_us_N, probs_NM)
         queries = Queries(frame, query_NM, cost_us_N, probs_NM, infer_us)
-        return Turn(frame, handles.copy(), request, free_NF, queries, returns_to_go_N, noise[:, n_queries:], no_query_N)
+        return Turn(frame, handles.copy(), request, free_NF, queries, returns_to_go_N, noise[:, n_queries:], ~asks_N)
 
     def _act(
-        self,
-        turn: Turn,
-        slots_N: NDArray[np.int64],
-        acquired_NM: NDArray[np.bool_],
-        costly_ND: NDArray[np.float32],
+        self, turn: Turn, slots_N: NDArray[np.int64], acquired_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]
     ) -> Actions:
         """A turn's second half: act, then advance the contexts of those bots whose step is finite."""
         contexts = self._contexts

@@ -119,9 +119,10 @@ class Turns:
 
     def _leave(self, slots_N: Slots) -> list[tuple[Turn, int]]:
         left: list[tuple[Turn, int]] = []
-        ids, counts = np.unique(self._turn_of_B[slots_N], return_counts=True)
+        ids_N = self._turn_of_B[slots_N]
         self._turn_of_B[slots_N] = _NONE
-        for key, count in zip(ids.tolist(), counts.tolist(), strict=True):
+        for key in _distinct_ids(ids_N):
+            count = int((ids_N == key).sum())
             if key != _NONE:
                 left.append((self._turns[key], count))
                 self._members[key] -= count
@@ -130,6 +131,10 @@ class Turns:
         return left
 
     def _distinct(self, slots_N: Slots) -> list[Turn | None]:
-        ids_N = self._turn_of_B[slots_N]
-        same = bool((ids_N == ids_N[0]).all())
-        return [self._turns.get(key) for key in (ids_N[:1] if same else np.unique(ids_N)).tolist()]
+        return [self._turns.get(key) for key in _distinct_ids(self._turn_of_B[slots_N])]
+
+
+def _distinct_ids(ids_N: NDArray[np.int64]) -> list[int]:
+    same = bool((ids_N == ids_N[0]).all())
+    ids: list[int] = (ids_N[:1] if same else np.unique(ids_N)).tolist()
+    return ids
