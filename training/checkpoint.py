@@ -5,7 +5,6 @@ Tensors and plain values only, read with `weights_only=True`: a checkpoint canno
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -77,8 +76,6 @@ def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainS
         "golden": facts.golden,
         "model": state.model.state_dict(),
         "optimiser": state.optimiser.state_dict(),
-        "batches": json.dumps(state.batches.bit_generator.state),
-        "uniforms": state.uniforms.get_state(),
         "done": state.done,
         "penalty_weight": state.penalty_weight,
         "seconds": state.seconds,
@@ -99,8 +96,6 @@ def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
             )
     state.model.load_state_dict(data["model"])
     state.optimiser.load_state_dict(data["optimiser"])
-    state.batches.bit_generator.state = json.loads(data["batches"])
-    state.uniforms.set_state(data["uniforms"])
     state.done, state.penalty_weight, state.seconds = data["done"], data["penalty_weight"], data["seconds"]
 
 

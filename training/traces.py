@@ -8,7 +8,6 @@ layout that stand in the dataset's own metadata. Shape letters: E episodes, S st
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from protocol.features import ActionSpec, FeatureTable
 
-__all__ = ["Batch", "Traces", "TracesError", "load_traces", "moments", "returns_to_go", "windows"]
+__all__ = ["Batch", "Traces", "TracesError", "draw_windows", "load_traces", "moments", "returns_to_go"]
 
 
 class TracesError(ValueError):
@@ -117,25 +116,24 @@ def moments(x_SD: Tensor) -> tuple[Tensor, Tensor]:
     return mean, torch.maximum(deviation, 0.1 * largest).clamp(min=1e-6)
 
 
-def windows(traces: Traces, batch: int, length: int, generator: np.random.Generator) -> Iterator[Batch]:
-    """Endless batches of windows [B, T]: an episode in proportion to its length, then a start that lets its first
-    timesteps be seen as often as the others."""
+def draw_windows(traces: Traces, batch: int, length: int, generator: np.random.Generator) -> Batch:
+    """A batch of windows [B, T]: an episode in proportion to its length, then a start that lets its first timesteps be
+    seen as often as the others."""
     share = traces.lengths_E / traces.lengths_E.sum()
-    while True:
-        episode_B = generator.choice(len(share), size=batch, p=share)
-        length_B = traces.lengths_E[episode_B]
-        start_B = generator.integers(-(length // 2), np.maximum(length_B - length // 2, 1))
-        start_B = start_B.clip(0, np.maximum(length_B - length, 0))
-        step_BT = start_B[:, None] + np.arange(length)
-        valid_BT = step_BT < length_B[:, None]
-        index_BT = torch.from_numpy(traces.starts_E[episode_B][:, None] + np.minimum(step_BT, length_B[:, None] - 1))
-        yield Batch(
-            traces.free_SF[index_BT],
-            traces.costly_SD[index_BT].float(),
-            traces.actions_SA[index_BT],
-            traces.returns_to_go_S[index_BT][..., None],
-            torch.from_numpy(valid_BT.astype(np.float32)),
-        )
+    episode_B = generator.choice(len(share), size=batch, p=share)
+    length_B = traces.lengths_E[episode_B]
+    start_B = generator.integers(-(length // 2), np.maximum(length_B - length // 2, 1))
+    start_B = start_B.clip(0, np.maximum(length_B - length, 0))
+    step_BT = start_B[:, None] + np.arange(length)
+    valid_BT = step_BT < length_B[:, None]
+    index_BT = torch.from_numpy(traces.starts_E[episode_B][:, None] + np.minimum(step_BT, length_B[:, None] - 1))
+    return Batch(
+        traces.free_SF[index_BT],
+        traces.costly_SD[index_BT].float(),
+        traces.actions_SA[index_BT],
+        traces.returns_to_go_S[index_BT][..., None],
+        torch.from_numpy(valid_BT.astype(np.float32)),
+    )
 
 
 def _text(value: object) -> str:

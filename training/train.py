@@ -28,7 +28,7 @@ from training.checkpoint import Facts, load_checkpoint, save_checkpoint
 from training.config import TrainConfig
 from training.models import BudgetedDecisionTransformer, ModelConfig
 from training.objectives import action_loss, nearest_bins, penalty, penalty_weight, query_cost
-from training.traces import Batch, Traces, load_traces, moments, windows
+from training.traces import Traces, draw_windows, load_traces, moments
 
 __all__ = ["TrainState", "build_model", "main", "train", "update"]
 
@@ -39,8 +39,6 @@ class TrainState:
 
     model: BudgetedDecisionTransformer
     optimiser: torch.optim.AdamW
-    batches: np.random.Generator  # draws the windows
-    uniforms: torch.Generator  # draws the noise u of the queries
     done: int = 0  # updates made
     penalty_weight: float = 0.0  # γ
     seconds: float = 0.0  # spent training, resumed runs included
@@ -83,11 +81,13 @@ def learning_rate(config: TrainConfig, done: int) -> float:
     return config.learning_rate * warm * 0.5 * (1.0 + math.cos(math.pi * done / config.updates))
 
 
-def update(config: TrainConfig, state: TrainState, batch: Batch, costs_M: torch.Tensor) -> None:
-    """One iteration of Algorithm 1's loop."""
-    model = state.model
+def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: torch.Tensor) -> None:
+    """One iteration of Algorithm 1's loop. Its chance depends on the seed and its number alone, so that a resumed run
+    is the run that was stopped."""
+    model, chance = state.model, np.random.default_rng([config.seed, state.done])
+    batch = draw_windows(traces, config.batch, config.window, chance)
     context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
-    uniforms_BTM = torch.rand(*batch.valid_BT.shape, len(costs_M), generator=state.uniforms)
+    uniforms_BTM = torch.from_numpy(chance.random((*batch.valid_BT.shape, len(costs_M)), dtype=np.float32))
     query_BTM, passes = sample_queries(model, context, batch.costly_BTD, uniforms_BTM)
     bins_BTA = nearest_bins(batch.actions_BTA, model.config.low, model.config.high, model.config.bins)
     parts: dict[str, float] = {}
@@ -120,7 +120,7 @@ def train(config: TrainConfig) -> TrainState:
     traces = load_traces(config.dataset, episodes=config.episodes)
     model = build_model(config, traces)
     optimiser = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
-    state = TrainState(model, optimiser, np.random.default_rng(config.seed), torch.Generator().manual_seed(config.seed))
+    state = TrainState(model, optimiser)
     facts = Facts.of(traces, config.target_return)
     checkpoint = config.out / "checkpoint.pt"
     if checkpoint.exists():
@@ -129,22 +129,24 @@ def train(config: TrainConfig) -> TrainState:
     _write_versions(config.out / "versions.json", traces)
     costs_M = torch.tensor(traces.features.costs_us, dtype=torch.float32)
     with _Run(config, state, checkpoint, facts) as run:
-        for batch in windows(traces, config.batch, config.window, state.batches):
-            if state.done >= config.updates:
-                break
-            update(config, state, batch, costs_M)
+        while state.done < config.updates:
+            update(config, state, traces, costs_M)
             run.record()
     return state
 
 
 class _Run:
-    """The outside of a run: progress, metrics and checkpoints; on leaving, whatever the reason, state is saved."""
+    """The outside of a run: progress, metrics and checkpoints. An interrupted run goes on from its last checkpoint."""
 
     def __init__(self, config: TrainConfig, state: TrainState, checkpoint: Path, facts: Facts) -> None:
         self._config, self._state, self._checkpoint, self._facts = config, state, checkpoint, facts
         self._sums: dict[str, float] = {}
         self._began = time.monotonic() - state.seconds
-        self._lines = (config.out / "metrics.jsonl").open("a")
+        metrics = config.out / "metrics.jsonl"
+        if metrics.exists():  # lines that came after the checkpoint will come again
+            kept = [line for line in metrics.read_text().splitlines(True) if json.loads(line)["update"] <= state.done]
+            metrics.write_text("".join(kept))
+        self._lines = metrics.open("a")
         self._board = SummaryWriter(str(config.out))
         columns = (*Progress.get_default_columns()[:2], TimeElapsedColumn(), TimeRemainingColumn())
         self._progress = Progress(*columns, TextColumn("{task.fields[now]}"))
@@ -158,7 +160,6 @@ class _Run:
         self._progress.stop()
         self._board.close()
         self._lines.close()
-        self._save()
 
     def record(self) -> None:
         """Count the update that was just made."""
@@ -170,8 +171,8 @@ class _Run:
         if state.done % config.log_every == 0:
             self._log({key: value / config.log_every for key, value in self._sums.items()})
             self._sums.clear()
-        if state.done % config.checkpoint_every == 0:
-            self._save()
+        if state.done % config.checkpoint_every == 0 or state.done == config.updates:
+            save_checkpoint(self._checkpoint, config, self._facts, state)
 
     def _log(self, means: dict[str, float]) -> None:
         line = {"update": self._state.done, "seconds": round(self._state.seconds, 1), **means}
@@ -181,9 +182,6 @@ class _Run:
             self._board.add_scalar(key, value, self._state.done)
         now = " ".join(f"{key} {means[key]:.3g}" for key in ("delta", "cost", "gamma", "passes"))
         self._progress.update(self._task, now=now)
-
-    def _save(self) -> None:
-        save_checkpoint(self._checkpoint, self._config, self._facts, self._state)
 
 
 def _write_versions(path: Path, traces: Traces) -> None:

@@ -18,7 +18,7 @@ def _one_thread() -> None:
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        return toy.write_dataset(tmp_path_factory.mktemp("datasets"), monkeypatch=monkeypatch)
+        return toy.write_dataset(tmp_path_factory.mktemp("datasets"), monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,9 @@ F, M = 3, 4
 OWNER = (0, 0, 1, 2, 3, 3)
 
 
-def network(seed: int, *, context_length: int = 4, n_layers: int = 2, spread: float = 1.0) -> BudgetedDecisionTransformer:
+def network(
+    seed: int, *, context_length: int = 4, n_layers: int = 2, spread: float = 1.0
+) -> BudgetedDecisionTransformer:
     """Random weights, with an acquisition head that depends strongly on the past."""
     torch.manual_seed(seed)
     config = ModelConfig(

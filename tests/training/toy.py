@@ -6,12 +6,14 @@ of left[0] when which is 0 and of right[0] when it is 1: half the frames need `l
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
 import minari
 import msgspec
 import numpy as np
+import pytest
 from minari.data_collector.episode_buffer import EpisodeBuffer
 
 from protocol.features import ActionComponent, ActionSpec, Feature, FeatureTable
@@ -47,27 +49,29 @@ def episode(rng: np.random.Generator, length: int) -> EpisodeBuffer:
     )
 
 
-def write_dataset(root: Path, episodes: int = 40, seed: int = 0, monkeypatch=None) -> Path:
+def write_dataset(root: Path, monkeypatch: pytest.MonkeyPatch, episodes: int = 40, seed: int = 0) -> Path:
     """A Minari dataset at root/toy/test-v0."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(root))
     rng = np.random.default_rng(seed)
     box = gym.spaces.Box
-    dataset = minari.create_dataset_from_buffers(
-        dataset_id="toy/test-v0",
-        buffer=[episode(rng, int(rng.integers(8, 30))) for _ in range(episodes)],
-        observation_space=gym.spaces.Dict(
-            {
-                "free": box(-np.inf, np.inf, (FEATURES.n_free,), np.float32),
-                "costly": box(-np.inf, np.inf, (FEATURES.n_costly,), np.float32),
-            }
-        ),
-        action_space=box(-1, 1, (ACTION.size,), np.float32),
-        author="tests",
-        author_email="tests",
-        code_permalink="none",
-        algorithm_name="toy",
-        description="toy",
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # minari asks for an environment; traces need none
+        dataset = minari.create_dataset_from_buffers(
+            dataset_id="toy/test-v0",
+            buffer=[episode(rng, int(rng.integers(8, 30))) for _ in range(episodes)],
+            observation_space=gym.spaces.Dict(
+                {
+                    "free": box(-np.inf, np.inf, (FEATURES.n_free,), np.float32),
+                    "costly": box(-np.inf, np.inf, (FEATURES.n_costly,), np.float32),
+                }
+            ),
+            action_space=box(-1, 1, (ACTION.size,), np.float32),
+            author="tests",
+            author_email="tests",
+            code_permalink="none",
+            algorithm_name="toy",
+            description="toy",
+        )
     dataset.storage.update_metadata(
         {"features": msgspec.json.encode(FEATURES).decode(), "action": msgspec.json.encode(ACTION).decode()}
     )

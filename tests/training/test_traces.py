@@ -1,0 +1,91 @@
+"""Reading traces: what a dataset must be, returns-to-go, normalisation and windows."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.training import toy
+from training.traces import TracesError, draw_windows, load_traces, moments, returns_to_go
+
+
+@given(st.lists(st.floats(-100, 100), min_size=1, max_size=30))
+def test_returns_to_go_is_the_sum_of_what_is_left(rewards: list[float]) -> None:
+    expected = [sum(rewards[t:]) for t in range(len(rewards))]
+    assert returns_to_go(np.array(rewards)).tolist() == pytest.approx(expected, abs=1e-2)
+
+
+def test_reads_what_was_recorded(dataset: Path) -> None:
+    traces = load_traces(dataset)
+    assert traces.features == toy.FEATURES
+    assert len(traces.lengths_E) == 40
+    assert traces.free_SF.shape == (traces.lengths_E.sum(), traces.features.n_free)
+    # The toy's clock counts the timesteps of each episode from 0.
+    clocks = [torch.arange(int(n)).float() for n in traces.lengths_E]
+    assert torch.equal(traces.free_SF[:, 1], torch.cat(clocks))
+    which = traces.free_SF[:, 0] == 0
+    answer = torch.sign(torch.where(which, traces.costly_SD[:, 0], traces.costly_SD[:, 2]).float())
+    assert torch.equal(traces.actions_SA[:, 0], answer)
+
+
+def test_windows_stay_inside_their_episode_and_mark_padding(dataset: Path) -> None:
+    traces = load_traces(dataset)
+    generator, starts = np.random.default_rng(0), set()
+    for _ in range(20):
+        batch = draw_windows(traces, 64, 12, generator)
+        valid = batch.valid_BT.bool()
+        assert valid[:, 0].all()
+        clock = batch.free_BTF[..., 1]
+        assert ((clock[:, 1:] - clock[:, :-1] == 1) | ~valid[:, 1:]).all()
+        starts |= set(clock[:, 0].tolist())
+    assert {0.0, 1.0} <= starts, "windows must begin at an episode's start as well as inside it"
+
+
+def test_moments_are_the_mean_and_a_floored_deviation() -> None:
+    x = torch.zeros(1000, 2)
+    x[:, 0] = torch.linspace(-1, 1, 1000)
+    x[0, 1] = 1.0  # a class seen once
+    mean, scale = moments(x)
+    assert mean.tolist() == pytest.approx([0.0, 0.001], abs=1e-6)
+    assert scale[0].item() == pytest.approx(x[:, 0].std(correction=0).item(), rel=1e-4)
+    assert scale[1].item() == pytest.approx(0.0999, rel=1e-3)
+
+
+def test_refuses_links_out_of_the_file(dataset: Path, tmp_path: Path) -> None:
+    bad = tmp_path / "bad"
+    shutil.copytree(dataset, bad)
+    with h5py.File(bad / "data" / "main_data.hdf5", "a") as root:
+        root["episode_0"]["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/x")
+    with pytest.raises(TracesError, match="ExternalLink, expected data"):
+        load_traces(bad)
+
+
+def test_refuses_a_symbolic_link(dataset: Path, tmp_path: Path) -> None:
+    bad = tmp_path / "bad"
+    shutil.copytree(dataset, bad)
+    data = bad / "data" / "main_data.hdf5"
+    data.rename(tmp_path / "elsewhere.hdf5")
+    data.symlink_to(tmp_path / "elsewhere.hdf5")
+    with pytest.raises(TracesError, match="symbolic link"):
+        load_traces(bad)
+
+
+def test_refuses_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
+    with pytest.raises(TracesError, match="not a Minari dataset"):
+        load_traces(tmp_path)
+
+
+def test_refuses_numbers_that_are_not_finite(dataset: Path, tmp_path: Path) -> None:
+    bad = tmp_path / "bad"
+    shutil.copytree(dataset, bad)
+    with h5py.File(bad / "data" / "main_data.hdf5", "a") as root:
+        root["episode_3"]["observations"]["costly"][2, 1] = np.nan
+    with pytest.raises(TracesError, match="episode 3: costly has numbers that are not finite"):
+        load_traces(bad)

@@ -1,0 +1,99 @@
+"""The loop: it learns what to acquire, keeps within its budget, and resumes as if it had never stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training import toy
+from training.acquisition import rollout, sample_queries
+from training.checkpoint import load_trained
+from training.config import TrainConfig
+from training.traces import load_traces
+from training.train import TrainState, train
+
+
+def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Path, TrainState]) -> None:
+    """`left` and `right` are learned to be worth their cost, `noise` and `dear` are not; γ rose from 0."""
+    _, state = trained
+    traces, model = load_traces(dataset), state.model
+    first = slice(0, int(traces.lengths_E[0]))
+    context = model.context(traces.free_SF[first][None], traces.returns_to_go_S[first][None, :, None])
+    costly = traces.costly_SD[first].float()[None]
+    with torch.no_grad():
+        query, _ = sample_queries(model, context, costly, torch.full((1, first.stop, 4), 0.5))
+        sampled = rollout(model, context, costly, query)
+        push = model.actions(sampled.hidden_BTW, torch.zeros(1, first.stop, 2))[0, :, 0]
+    left, right, noise, dear = sampled.probs_BTM[0].mean(0).tolist()
+    assert max(noise, dear) < 0.2 < 0.5 < max(left, right)
+    assert (push == traces.actions_SA[first, 0]).float().mean() > 0.8
+    assert 0.0 < state.penalty_weight <= 250 * 0.01 + 1e-9
+
+
+def test_a_stopped_run_resumes_to_the_same_weights(dataset: Path, tmp_path: Path) -> None:
+    whole = train(toy.config(dataset, tmp_path / "whole", updates=30, checkpoint_every=8))
+    halves = toy.config(dataset, tmp_path / "halves", updates=30, checkpoint_every=8)
+    train_interrupted(halves, after=17)
+    resumed = train(halves)
+    assert resumed.done == 30
+    assert resumed.penalty_weight == whole.penalty_weight
+    assert (tmp_path / "halves" / "metrics.jsonl").read_text().count("\n") == 3
+    for name, value in whole.model.state_dict().items():
+        assert torch.equal(value, resumed.model.state_dict()[name]), name
+
+
+def train_interrupted(config: TrainConfig, after: int) -> None:
+    """Ctrl-C in the middle of a run."""
+    import training.train as room
+
+    original, calls = room.update, 0
+
+    def stopping(*arguments: object) -> None:
+        nonlocal calls
+        calls += 1
+        if calls > after:
+            raise KeyboardInterrupt
+        original(*arguments)
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(room, "update", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            room.train(config)
+
+
+def test_writes_what_is_needed_to_repeat_the_run(trained: tuple[Path, TrainState]) -> None:
+    out, state = trained
+    config = TrainConfig.read(out / "config.json")
+    assert config.out == out
+    assert config == load_trained(out / "checkpoint.pt").config
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [line["update"] for line in lines] == list(range(10, 251, 10))
+    assert lines[-1]["delta"] < lines[0]["delta"]
+    assert json.loads((out / "versions.json").read_text())["torch"].startswith("2.13.0")
+    assert state.done == 250
+
+
+def test_refuses_to_resume_with_other_settings(dataset: Path, tmp_path: Path) -> None:
+    config = toy.config(dataset, tmp_path, updates=1)
+    train(config)
+    with pytest.raises(ValueError, match="trained with budget"):
+        train(dataclasses.replace(config, budget=0.9))
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "message"),
+    [("budget", 1.5, "budget is 1.5"), ("width", 15, "not a multiple"), ("context_length", 1, "2 or more")],
+)
+def test_refuses_settings_that_cannot_be(dataset: Path, setting: str, value: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        toy.config(dataset, Path("nowhere"), **{setting: value})
+
+
+def test_unknown_settings_in_a_file_are_errors(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"dataset": "a", "out": "b", "name": "c", "lerning_rate": 1}')
+    with pytest.raises(ValueError, match="lerning_rate"):
+        TrainConfig.read(tmp_path / "config.json")
