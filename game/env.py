@@ -61,9 +61,9 @@ class NavigationEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     metadata = {"render_modes": []}  # noqa: RUF012  (gymnasium's own spelling)
 
-    def __init__(self, map: str = "hard", max_decisions: int = MAX_DECISIONS) -> None:
+    def __init__(self, map: str = "hard", costs: str = "godot", max_decisions: int = MAX_DECISIONS) -> None:
         self.terrain = load_map(map)
-        self.table = feature_table()
+        self.table = feature_table(load_costs(costs))
         self.max_decisions = max_decisions
         self.world = World(self.terrain)
         self.layout: Layout | None = None
@@ -156,3 +156,10 @@ class NavigationEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 gymnasium.register(id="Navigation-v0", entry_point="game.env:NavigationEnv", order_enforce=False)
+for _shipped in ("easy", "hard"):
+    gymnasium.register(
+        id=f"Navigation-{_shipped}-v0",
+        entry_point="game.env:NavigationEnv",
+        kwargs={"map": _shipped},
+        order_enforce=False,
+    )
