@@ -6,7 +6,6 @@ This module knows nothing about pybullet or actions.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +13,8 @@ from numpy.typing import NDArray
 from game.character import Character
 from game.grid import Grid
 from game.layout import Layout, open_stretches
+from game.skills import Skill
 from game.terrain import Rect, Terrain
-
-if TYPE_CHECKING:
-    from game.players import Skill
 
 __all__ = ["Beliefs"]
 

@@ -28,8 +28,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from game.env import ACTION_SPEC, NavigationEnv
-from game.players import EXPERT, INTERMEDIATE, Kicks, Player
+from game.players import Kicks, Player
 from game.recording import Episode, Summary, merge_shards, summarise, write_shard
+from game.skills import EXPERT, INTERMEDIATE
 
 __all__ = ["Collect", "collect", "dataset_id", "play_episode"]
 

@@ -1,4 +1,4 @@
-"""Scripted players of two qualities, and the kicks that disturb them while they are recorded.
+"""Scripted players, and the kicks that disturb them while they are recorded.
 
 A player knows the map by heart but not the episode: which bridges stand and where pools lie it must see, within its
 sight and field of view, as an agent with rays must. It walks down a cost-to-go field over what it believes.
@@ -9,7 +9,6 @@ This module knows nothing about rays, rewards or files.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,36 +18,16 @@ from game.character import SPEED_M_S, TURN_RAD, Character
 from game.env import NavigationEnv
 from game.grid import Grid
 from game.layout import Layout
+from game.skills import Skill
 from game.terrain import Terrain
 
-__all__ = ["EXPERT", "INTERMEDIATE", "Kicks", "Player", "Skill"]
+__all__ = ["Kicks", "Player"]
 
 _AIM_CELLS = 7
 _LEDGE_AHEAD_M = (0.35, 0.7, 1.1, 1.5)
 _ON_TOP_M = 0.05
 _MARGIN_COST = 4.0
 """Cells cheaper than this may be walked straight through; dearer ones lie on the brink of a hazard."""
-
-
-@dataclass(frozen=True)
-class Skill:
-    """How well a player sees and moves."""
-
-    name: str
-    speed: float  # forward on open ground, 0 to 1
-    careful_speed: float  # forward while an unexplored crossing or a brink is near
-    turn_noise: float  # standard deviation of the turn, in units of 30 degrees
-    reaction: int  # decisions between aiming and turning
-    pause_chance: float  # per decision, to stop and look
-    pause_decisions: int  # longest stop
-    sight_m: float  # bridges and pools are recognised this far away
-    misjudge_chance: float  # per bridge or pool, to believe the wrong thing
-    brink_m: float  # distance kept from lava and water
-    variety: float  # how much the believed costs vary between episodes
-
-
-EXPERT = Skill("expert", 1.0, 0.6, 0.05, 0, 0.004, 3, 14.0, 0.0, 1.4, 0.5)
-INTERMEDIATE = Skill("intermediate", 0.8, 0.6, 0.2, 2, 0.02, 8, 9.0, 0.12, 0.6, 1.0)
 
 
 class Player:

@@ -1,4 +1,4 @@
-"""The 96 rays: where they point, what they cost, how their hits are encoded; and the calibration of their cost.
+"""The 96 rays: where they point, what they cost, how their hits are encoded.
 
 This module knows nothing about episodes, rewards or players.
 
@@ -8,15 +8,20 @@ This module knows nothing about episodes, rewards or players.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+import tyro
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
 
 from game.character import EYE_M
+from game.terrain import load_map
 from protocol.features import CostModel, Feature
 
 __all__ = [
@@ -29,6 +34,7 @@ __all__ = [
     "cost_model",
     "encode",
     "load_costs",
+    "ray_features",
     "segments",
 ]
 
@@ -121,3 +127,34 @@ def encode(chosen: NDArray[np.int64], fractions: list[float], classes: NDArray[n
     values_M6[chosen, 0] = np.array(fractions) * _RANGE_M[chosen]
     values_M6[chosen, 1 + classes] = 1.0
     return values_M6.ravel()
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Show what rays cost, or measure it."""
+
+    calibrate: bool = False  # measure on this machine and write the table
+    map: str = "hard"  # where to measure
+    out: Path = Path(__file__).parent / "costs" / "pybullet.json"  # what --calibrate writes; `pybullet` reads it
+    costs: str = "godot"  # without --calibrate: the table to show
+
+
+def main() -> None:
+    """Command line."""
+    config = tyro.cli(Rays, description=__doc__)
+    if config.calibrate:
+        from game.calibration import calibrate  # it needs the world, which needs this module
+
+        costs = calibrate(load_map(config.map))
+        config.out.write_bytes(msgspec.json.format(msgspec.json.encode(costs)) + b"\n")
+    else:
+        costs = load_costs(config.costs)
+    table = Table("range m", "µs a ray", "rays", title=f"{costs.source}\n{costs.call_us:g} µs a call")
+    for range_m in RANGES_M:
+        table.add_row(str(range_m), f"{costs.range_us[range_m]:g}", str(sum(ray.range_m == range_m for ray in RAYS)))
+    table.add_row("all", f"{cost_model(costs).full_us:.1f} µs", str(len(RAYS)))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
