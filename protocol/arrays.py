@@ -1,30 +1,29 @@
-"""The blobs, bits and ragged values of a message to numpy arrays and back, shapes, finiteness and ranges checked.
+"""The blobs, bits and ragged values of a message to numpy arrays and back, their shapes checked.
 
-This module knows nothing about messages, sockets or bots. Shape letters as in `protocol.features`.
+This module knows nothing about messages, sockets or bots, nor which numbers are legal: the bots check that. Shape
+letters as in `protocol.features`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.codec import Format
-from protocol.errors import BadShape, NonFinite, OutOfRange
-from protocol.features import Feature, FeatureTable
+from protocol.errors import BadShape, OutOfRange
+from protocol.features import FeatureTable
 from protocol.messages import Bits, Blob
 
-__all__ = ["bits", "check_range", "floats", "numbers", "pack_bits", "pack_floats", "pack_values", "unpack_values"]
-
-Array = TypeVar("Array", NDArray[np.float32], NDArray[np.float64])
+__all__ = ["bits", "floats", "pack_bits", "pack_floats", "unpack_values"]
 
 
 def floats(blob: Blob, shape: tuple[int, int], name: str) -> NDArray[np.float32]:
-    """A blob as float32 of `shape`; raises BadShape, NonFinite, OutOfRange (a number that float32 cannot hold)."""
+    """A blob as float32 of `shape`; raises BadShape, OutOfRange (a number that float32 cannot hold)."""
     if isinstance(blob, bytes):
-        return _finite(_from_bytes(blob, shape, name), name)
+        return _from_bytes(blob, shape, name)
     _check_rows(blob, shape, name)
     return _narrow(np.array(blob, dtype=np.float64).reshape(shape), name)
 
@@ -45,38 +44,6 @@ def bits(blob: Bits, shape: tuple[int, int], name: str) -> NDArray[np.bool_]:
     return unpacked[:, :columns]
 
 
-def numbers(values: Sequence[float] | None, count: int, name: str) -> NDArray[np.float64] | None:
-    """One finite number a bot, or None where the message has none; raises BadShape, NonFinite."""
-    if values is None:
-        return None
-    if len(values) != count:
-        raise BadShape(f"{name} has {len(values)} numbers, expected {count}, one a bot")
-    array = np.array(values, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise NonFinite(f"{name}[{int(np.flatnonzero(~np.isfinite(array))[0])}] is not finite")
-    return array
-
-
-def check_range(
-    values: NDArray[np.float32],
-    limits: tuple[NDArray[np.float32], NDArray[np.float32]],
-    features: Sequence[Feature],
-    where: NDArray[np.bool_] | None = None,
-) -> None:
-    """Raise OutOfRange, naming bot and feature, if a number [N, n] (only `where` true) leaves its feature's range."""
-    low, high = limits
-    outside = (values < low) | (values > high)
-    if where is not None:
-        outside &= where
-    if outside.any():
-        bot, column = (int(index) for index in np.argwhere(outside)[0])
-        feature = _feature_at(features, column)
-        raise OutOfRange(
-            f"{feature.name} of bot {bot} in the message is {float(values[bot, column]):g}, "
-            f"its range is [{feature.low:g}, {feature.high:g}]"
-        )
-
-
 def pack_floats(array: NDArray[np.float32], form: Format) -> Blob:
     """float32 [N, n] as the blob of this format."""
     if form is Format.JSON:
@@ -91,27 +58,21 @@ def pack_bits(array: NDArray[np.bool_], form: Format) -> Bits:
     return np.packbits(array, axis=1, bitorder="little").tobytes()
 
 
-def pack_values(costly_ND: NDArray[np.float32], acquired_NM: NDArray[np.bool_], table: FeatureTable) -> bytes:
-    """The acquired numbers alone, bot after bot, feature after feature, as float32 little-endian."""
-    return costly_ND[acquired_NM[:, table.owner]].astype("<f4", copy=False).tobytes()
-
-
 def unpack_values(values: Blob, acquired_NM: NDArray[np.bool_], table: FeatureTable) -> NDArray[np.float32]:
     """Ragged values as dense float32 [N, D], zero where not acquired.
 
-    Raises BadShape (too few or too many numbers for what `acquired` says), NonFinite, OutOfRange.
+    Raises BadShape (too few or too many numbers for what `acquired` says), OutOfRange as `floats` does.
     """
     present_ND = acquired_NM[:, table.owner]
     dense_ND = np.zeros(present_ND.shape, dtype=np.float32)
     dense_ND[present_ND] = _ragged(values, present_ND)
-    check_range(dense_ND, table.costly_range, table.costly, where=present_ND)
     return dense_ND
 
 
 def _ragged(values: Blob, present_ND: NDArray[np.bool_]) -> NDArray[np.float32]:
     expected = int(np.count_nonzero(present_ND))
     if isinstance(values, bytes):
-        return _finite(_from_bytes(values, (1, expected), "values")[0], "values")
+        return _from_bytes(values, (1, expected), "values").ravel()
     counts = present_ND.sum(axis=1)
     if len(values) != len(counts):
         raise BadShape(f"values has {len(values)} lists, expected {len(counts)}, one a bot")
@@ -136,21 +97,8 @@ def _check_rows(rows: Sequence[Sequence[float]], shape: tuple[int, int], name: s
 
 
 def _narrow(array: NDArray[np.float64], name: str) -> NDArray[np.float32]:
-    _finite(array, name)
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused here
         narrow = array.astype(np.float32)
-    if not np.isfinite(narrow).all():
+    if (np.isinf(narrow) & np.isfinite(array)).any():
         raise OutOfRange(f"{name} holds a number too large for float32")
     return narrow
-
-
-def _finite(array: Array, name: str) -> Array:
-    finite = np.isfinite(array)
-    if not finite.all():
-        raise NonFinite(f"{name}{[int(i) for i in np.argwhere(~finite)[0]]} is not finite")
-    return array
-
-
-def _feature_at(features: Sequence[Feature], column: int) -> Feature:
-    ends = np.cumsum([feature.size for feature in features])
-    return features[int(np.searchsorted(ends, column, side="right"))]

@@ -17,10 +17,12 @@ __all__ = [
     "BadShape",
     "FrameReused",
     "InternalError",
+    "MethodNotAllowed",
     "MissingFeature",
     "NoBot",
     "NoConnection",
     "NoPendingQuery",
+    "NoRoute",
     "NonFinite",
     "NotReady",
     "OutOfRange",
@@ -85,6 +87,18 @@ class NoConnection(ProtocolError):
     """No such connection: never opened, closed, idle for too long, or from before a restart."""
 
     code, status = "NO_CONNECTION", 404
+
+
+class NoRoute(ProtocolError):
+    """HTTP only: nothing is served at this path."""
+
+    code, status = "NO_ROUTE", 404
+
+
+class MethodNotAllowed(ProtocolError):
+    """HTTP only: this path is served, by another method."""
+
+    code, status = "METHOD_NOT_ALLOWED", 405
 
 
 class NoPendingQuery(ProtocolError):

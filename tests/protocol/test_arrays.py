@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from protocol import arrays
 from protocol.codec import Format
-from protocol.errors import BadShape, NonFinite, OutOfRange
+from protocol.errors import BadShape, OutOfRange
 from protocol.features import Feature, FeatureTable
 from tests.protocol.golden import TABLE
 
@@ -42,12 +42,11 @@ def test_floats_survive_the_wire(matrix: np.ndarray, form: Format) -> None:
 
 @settings(deadline=None)
 @given(st.data())
-def test_values_survive_the_wire_and_only_the_acquired_ones_travel(data: st.DataObject) -> None:
+def test_values_survive_the_wire(data: st.DataObject) -> None:
     n = data.draw(st.integers(1, 4))
     acquired = data.draw(hnp.arrays(np.bool_, (n, TABLE.n_queries)))
     costly = data.draw(hnp.arrays(np.float32, (n, TABLE.n_costly), elements=st.floats(0, 50, width=32)))
-    packed = arrays.pack_values(costly, acquired, TABLE)
-    assert len(packed) == 4 * int((acquired @ TABLE.sizes).sum())
+    packed = costly[np.repeat(acquired, TABLE.sizes, axis=1)].astype("<f4").tobytes()
     expected = np.where(acquired[:, TABLE.owner], costly, 0)
     assert np.array_equal(arrays.unpack_values(packed, acquired, TABLE), expected)
     rows = [row[mask].tolist() for row, mask in zip(costly, acquired[:, TABLE.owner], strict=True)]
@@ -68,16 +67,9 @@ def test_bits_of_another_shape_are_refused_by_name(blob: bytes | list[list[int]]
         arrays.bits(blob, (2, 10), "acquired")
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_none_are_refused(bad: float) -> None:
-    matrix = np.array([[0.0, bad]], dtype=np.float32)
-    for form in Format:
-        with pytest.raises(NonFinite, match=r"free\[0, 1\]"):
-            arrays.floats(arrays.pack_floats(matrix, form), (1, 2), "free")
-    with pytest.raises(NonFinite, match=r"rewards\[1\]"):
-        arrays.numbers([0.0, bad], 2, "rewards")
-    with pytest.raises(NonFinite):
-        arrays.unpack_values([[bad, 0.0]], np.eye(1, TABLE.n_queries, dtype=bool), TABLE)
+def test_what_is_no_number_is_left_to_the_bots_to_refuse() -> None:
+    assert np.isnan(arrays.floats([[float("nan")]], (1, 1), "free")).all()
+    assert np.isinf(arrays.floats([[float("inf")]], (1, 1), "free")).all()
 
 
 def test_a_number_too_large_for_float32_is_out_of_range() -> None:
@@ -85,18 +77,7 @@ def test_a_number_too_large_for_float32_is_out_of_range() -> None:
         arrays.floats([[1e300]], (1, 1), "free")
 
 
-def test_a_value_outside_its_features_range_is_refused_by_feature_and_bot() -> None:
-    acquired = np.zeros((2, TABLE.n_queries), dtype=bool)
-    acquired[1, 4] = True
-    with pytest.raises(OutOfRange, match=r"ray_04 of bot 1 .* 50\.5, its range is \[0, 50\]"):
-        arrays.unpack_values([[], [50.5]], acquired, TABLE)
-    free = np.zeros((1, TABLE.n_free), dtype=np.float32)
-    free[0, 2] = -1
-    with pytest.raises(OutOfRange, match="on_ground of bot 0"):
-        arrays.check_range(free, TABLE.free_range, TABLE.free)
-
-
-def test_what_was_not_acquired_is_zero_even_where_zero_is_out_of_range() -> None:
+def test_what_was_not_acquired_is_zero() -> None:
     table = FeatureTable((Feature("far", 1, cost_us=1.0, low=10.0, high=20.0),))
     assert arrays.unpack_values(b"", np.zeros((3, 1), dtype=bool), table).tolist() == [[0.0]] * 3
 
@@ -107,9 +88,3 @@ def test_more_or_fewer_values_than_acquired_are_refused(values: bytes | list[lis
     acquired[0, 0] = True  # two numbers, for the first bot
     with pytest.raises(BadShape, match="values"):
         arrays.unpack_values(values, acquired, TABLE)
-
-
-def test_one_number_a_bot() -> None:
-    assert arrays.numbers(None, 2, "rewards") is None
-    with pytest.raises(BadShape, match="rewards has 1 numbers, expected 2"):
-        arrays.numbers([0.0], 2, "rewards")

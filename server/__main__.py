@@ -1,0 +1,63 @@
+"""`python -m server --bundle bundles/hard`: serve until SIGTERM or Ctrl-C, then drain and exit with 0.
+
+This module knows nothing about what is served.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import sys
+from pathlib import Path
+
+import tyro
+import uvloop
+
+from protocol.errors import BadBundle
+from server.app import running
+from server.settings import Settings
+
+__all__ = ["main"]
+
+_log = logging.getLogger("server")
+
+
+async def _serve(settings: Settings) -> None:
+    stop = asyncio.Event()
+    for signal_number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(signal_number, stop.set)
+    async with running(settings) as addresses:
+        _log.info("serving %s at %s", settings.bundle, ", ".join(addresses.values()))
+        try:
+            if settings.ready_file is not None:
+                _write(settings.ready_file, {**addresses, "pid": os.getpid()})
+            await stop.wait()
+        finally:
+            if settings.ready_file is not None:
+                settings.ready_file.unlink(missing_ok=True)
+        _log.info("draining")
+
+
+def _write(path: Path, content: dict[str, str | int]) -> None:
+    """Whole or not at all: whoever waits for the file must never read half of it."""
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}")
+    unfinished.write_text(json.dumps(content) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+
+
+def main() -> None:
+    """Parse the command line and serve. Exits with 2 for settings or a bundle that cannot be served."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    try:
+        settings = tyro.cli(Settings, description="Serve one bundle to game engines.")
+        uvloop.run(_serve(settings))
+    except (ValueError, BadBundle, OSError) as error:
+        _log.error("%s", error)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Assembly: a bundle, its bots, the worker and the doors, opened together and drained together.
+
+This module knows nothing about signals or the command line.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
+
+import uvicorn
+
+from bot_runtime.bots import Bots
+from bot_runtime.bundle import Bundle
+from server.connections import Connections
+from server.handlers import Handlers
+from server.http import HttpDoor, create_app
+from server.settings import Settings
+from server.stream import StreamDoor
+from server.worker import Worker
+
+__all__ = ["running"]
+
+_BACKLOG = 512
+
+
+@asynccontextmanager
+async def running(settings: Settings, *, clock: Callable[[], float] = time.monotonic) -> AsyncIterator[dict[str, str]]:
+    """Serve inside the `async with`; yields the addresses by door: `http`, `tcp`, `unix`.
+
+    On leaving it is not ready at once, closes idle sockets, answers what is in progress for at most `drain_s`, and
+    leaves no thread, socket or file behind. `clock` is what connections age by. Raises BadBundle, OSError.
+    """
+    bots = Bots(Bundle.load(settings.bundle), max_bots=settings.max_bots)
+    handlers = Handlers(bots, Connections(settings.max_connections, settings.idle_ttl_s, clock), settings.token)
+    async with AsyncExitStack() as stack:
+        worker = Worker(settings.max_queue)
+        stack.callback(worker.close)
+        http = HttpDoor(handlers, worker, bots.bundle.manifest, body_deadline_s=settings.frame_deadline_s)
+        uvicorn_server, http_address = await stack.enter_async_context(_http(settings, http))
+        stream = StreamDoor(
+            handlers,
+            worker,
+            max_sockets=settings.max_connections,
+            frame_deadline_s=settings.frame_deadline_s,
+            idle_ttl_s=settings.idle_ttl_s,
+        )
+        addresses = {"http": http_address, **await stack.enter_async_context(_streams(settings, stream))}
+        await stack.enter_async_context(_sweeping(handlers, worker, settings.idle_ttl_s / 4))
+        try:
+            yield addresses
+        finally:
+            http.ready = False
+            uvicorn_server.should_exit = True  # drains in its own task while the streams are drained here
+
+
+class _Uvicorn(uvicorn.Server):
+    """uvicorn without its signal handlers: it would end the process by raising the signal again, not with 0."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+@asynccontextmanager
+async def _http(settings: Settings, door: HttpDoor) -> AsyncIterator[tuple[uvicorn.Server, str]]:
+    listening = _listen(settings.host, settings.port)
+    server = _Uvicorn(
+        uvicorn.Config(
+            create_app(door),
+            http="httptools",
+            ws="none",
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            date_header=False,
+            timeout_keep_alive=max(1, int(settings.idle_ttl_s)),
+            timeout_graceful_shutdown=max(1, int(settings.drain_s)),
+        )
+    )
+    serving = asyncio.create_task(server.serve(sockets=[listening]))
+    try:
+        while not server.started:
+            if serving.done():
+                serving.result()
+            await asyncio.sleep(0.005)
+        yield server, f"http://{_host(settings.host)}:{listening.getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        await serving
+        listening.close()
+
+
+@asynccontextmanager
+async def _streams(settings: Settings, door: StreamDoor) -> AsyncIterator[dict[str, str]]:
+    addresses: dict[str, str] = {}
+    servers: list[asyncio.Server] = []
+    try:
+        if settings.tcp_port is not None:
+            listening = _listen(settings.host, settings.tcp_port)
+            servers.append(await asyncio.start_server(door.serve, sock=listening, backlog=_BACKLOG))
+            addresses["tcp"] = f"tcp://{_host(settings.host)}:{listening.getsockname()[1]}"
+        if settings.uds is not None:
+            servers.append(await asyncio.start_unix_server(door.serve, path=settings.uds, backlog=_BACKLOG))
+            addresses["unix"] = f"unix://{settings.uds.absolute()}"
+        yield addresses
+    finally:
+        for server in servers:
+            server.close()
+        await door.drain(settings.drain_s)
+        for server in servers:
+            await server.wait_closed()
+        if settings.uds is not None and "unix" in addresses:
+            settings.uds.unlink(missing_ok=True)
+
+
+@asynccontextmanager
+async def _sweeping(handlers: Handlers, worker: Worker, every_s: float) -> AsyncIterator[None]:
+    async def sweep() -> None:
+        while True:
+            await asyncio.sleep(every_s)
+            worker.post(handlers.end_silent)
+
+    sweeping = asyncio.create_task(sweep())
+    try:
+        yield
+    finally:
+        sweeping.cancel()
+        with suppress(asyncio.CancelledError):
+            await sweeping
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listening = socket.create_server((host, port), family=family, backlog=_BACKLOG)
+    listening.setblocking(False)
+    return listening
+
+
+def _host(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

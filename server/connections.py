@@ -1,0 +1,78 @@
+"""Connections: who is there, which bots are theirs, and since when they have been silent.
+
+This module knows nothing about transports, messages or what a bot is beyond its handle.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from protocol.errors import BadSchema, NoBot, NoConnection, TooManyConnections
+from protocol.features import CostModel
+
+__all__ = ["Connection", "Connections"]
+
+
+@dataclass(eq=False)
+class Connection:
+    """One engine's link to the server; it alone may name its bots."""
+
+    id: str
+    cost_model: CostModel
+    last_seen_s: float
+    bots: set[int] = field(default_factory=set)
+
+    def check_owns(self, handles: Sequence[int]) -> None:
+        """Raise NoBot for a bot that is not this connection's, BadSchema for a bot named twice."""
+        named = set(handles)
+        if not named <= self.bots:
+            unknown = next(handle for handle in handles if handle not in self.bots)
+            raise NoBot(f"no bot {unknown} on this connection")
+        if len(named) != len(handles):
+            raise BadSchema("a message names each of its bots once")
+
+
+class Connections:
+    """Every open connection, by its unguessable name. `clock` is monotonic, in seconds."""
+
+    def __init__(self, max_connections: int, idle_ttl_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._by_id: dict[str, Connection] = {}
+        self._max_connections = max_connections
+        self._idle_ttl_s = idle_ttl_s
+        self._clock = clock
+
+    def __len__(self) -> int:
+        return len(self._by_id)
+
+    def open(self, cost_model: CostModel) -> Connection:
+        """A new connection; raises TooManyConnections."""
+        if len(self._by_id) >= self._max_connections:
+            raise TooManyConnections(f"all {self._max_connections} connections are taken", retry_after_s=1.0)
+        connection = Connection(secrets.token_hex(16), cost_model, self._clock())
+        self._by_id[connection.id] = connection
+        return connection
+
+    def get(self, connection_id: str | None) -> Connection:
+        """The connection of this name, which is thereby heard from; raises NoConnection, also if it is overdue."""
+        connection = self._by_id.get(connection_id) if connection_id is not None else None
+        if connection is None or self._is_silent(connection):
+            raise NoConnection("say hello first" if connection_id is None else "no such connection: say hello again")
+        connection.last_seen_s = self._clock()
+        return connection
+
+    def remove(self, connection_id: str) -> Connection | None:
+        """Forget a connection, and return it if there was one."""
+        return self._by_id.pop(connection_id, None)
+
+    def remove_silent(self) -> list[Connection]:
+        """Forget every connection that has been silent for longer than the TTL, and return them."""
+        silent = [connection for connection in self._by_id.values() if self._is_silent(connection)]
+        for connection in silent:
+            del self._by_id[connection.id]
+        return silent
+
+    def _is_silent(self, connection: Connection) -> bool:
+        return self._clock() - connection.last_seen_s > self._idle_ttl_s

@@ -1,0 +1,147 @@
+"""What each message does: the one place where messages meet bots, for every transport.
+
+This module knows nothing about sockets, HTTP or bytes. It runs on the worker's thread alone. Everything is checked
+before any bot is touched, so a refused request leaves every bot as it was.
+"""
+
+from __future__ import annotations
+
+import hmac
+
+import numpy as np
+
+from bot_runtime.bots import Bots
+from protocol import arrays
+from protocol.codec import Format, body_limit
+from protocol.errors import BadSchema, BadShape, Unauthorized
+from protocol.features import CostModel
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Actions,
+    BotsStarted,
+    BotsStopped,
+    Farewell,
+    Goodbye,
+    Hello,
+    Queries,
+    Reply,
+    Request,
+    RequestQueries,
+    StartBots,
+    StopBots,
+    SubmitFeatures,
+    Welcome,
+)
+from server.connections import Connection, Connections
+
+__all__ = ["Handlers"]
+
+
+class Handlers:
+    """Answers requests of known connections with these bots. `token` is what Hello must carry, if anything."""
+
+    def __init__(self, bots: Bots, connections: Connections, token: str | None) -> None:
+        self._bots = bots
+        self._manifest = bots.bundle.manifest
+        self._table = self._manifest.features
+        self._connections = connections
+        self._token = token
+        self.max_body_bytes = body_limit(self._table, bots.max_bots)
+
+    def handle(self, request: Request, connection_id: str | None, form: Format) -> Reply:
+        """The reply to one request, its blobs written for `form`. Raises ProtocolError, having done nothing."""
+        if isinstance(request, Hello):
+            return self._hello(request, connection_id)
+        connection = self._connections.get(connection_id)
+        match request:
+            case RequestQueries():
+                return self._request_queries(request, connection, form)
+            case SubmitFeatures():
+                return self._submit_features(request, connection, form)
+            case StartBots():
+                return self._start_bots(request, connection)
+            case StopBots():
+                return self._stop_bots(request, connection)
+            case Goodbye():
+                self.end(connection.id)
+                return Farewell()
+
+    def end(self, connection_id: str) -> None:
+        """End a connection and its bots; one that has ended already is no error."""
+        connection = self._connections.remove(connection_id)
+        if connection is not None:
+            self._stop(connection, list(connection.bots))
+
+    def end_silent(self) -> None:
+        """End every connection that has been silent for longer than its time to live."""
+        for connection in self._connections.remove_silent():
+            self._stop(connection, list(connection.bots))
+
+    def check_token(self, token: str | None) -> None:
+        """Raise Unauthorized unless this is the server's token, or it has none. Takes equally long either way."""
+        if self._token is None:
+            return
+        if token is None or not hmac.compare_digest(token.encode(), self._token.encode()):
+            raise Unauthorized("the token is missing or wrong")
+
+    def _hello(self, hello: Hello, connection_id: str | None) -> Welcome:
+        self.check_token(hello.token)
+        if connection_id is not None:
+            raise BadSchema("this socket has said hello already: it carries one connection")
+        if hello.protocol != PROTOCOL_VERSION:
+            raise BadSchema(f"protocol {hello.protocol} is not spoken here, expected {PROTOCOL_VERSION}")
+        cost_model = hello.cost_model or CostModel.declared(self._table)
+        if len(cost_model.feature_us) != self._table.n_queries:
+            raise BadShape(
+                f"cost_model.feature_us has {len(cost_model.feature_us)} numbers, expected {self._table.n_queries}"
+            )
+        self.end_silent()
+        return Welcome(
+            connection=self._connections.open(cost_model).id,
+            bundle=self._manifest.name,
+            features=self._table,
+            action=self._manifest.action,
+            cost_model=cost_model,
+            budget_us=self._manifest.budget_us,
+            context_length=self._manifest.context_length,
+            max_bots=self._bots.max_bots,
+            max_body_bytes=self.max_body_bytes,
+        )
+
+    def _start_bots(self, request: StartBots, connection: Connection) -> BotsStarted:
+        handles = self._bots.start(
+            request.count,
+            seeds=request.seeds,
+            target_returns=request.target_returns,
+            budgets_us=request.budgets_us,
+            cost_model=connection.cost_model,
+        ).tolist()
+        connection.bots.update(handles)
+        return BotsStarted(bots=handles)
+
+    def _request_queries(self, request: RequestQueries, connection: Connection, form: Format) -> Queries:
+        connection.check_owns(request.bots)
+        free_NF = arrays.floats(request.free, (len(request.bots), self._table.n_free), "free")
+        handles_N = np.array(request.bots, dtype=np.int64)
+        turn = self._bots.request_queries(handles_N, request.frame, free_NF, request.rewards, request.frame_budget_us)
+        queries = arrays.pack_bits(turn.query_NM, form)
+        return Queries(frame=turn.frame, queries=queries, cost_us=turn.cost_us_N.tolist(), infer_us=turn.infer_us)
+
+    def _submit_features(self, request: SubmitFeatures, connection: Connection, form: Format) -> Actions:
+        connection.check_owns(request.bots)
+        shape = len(request.bots), self._table.n_queries
+        acquired_NM = arrays.bits(request.acquired, shape, "acquired")
+        failed_NM = None if request.failed is None else arrays.bits(request.failed, shape, "failed")
+        costly_ND = arrays.unpack_values(request.values, acquired_NM, self._table)
+        handles_N = np.array(request.bots, dtype=np.int64)
+        turn = self._bots.submit_features(handles_N, request.frame, acquired_NM, costly_ND, failed_NM)
+        actions = arrays.pack_floats(turn.action_NA, form)
+        return Actions(frame=turn.frame, actions=actions, reasons=turn.reasons_N.tolist(), infer_us=turn.infer_us)
+
+    def _stop_bots(self, request: StopBots, connection: Connection) -> BotsStopped:
+        connection.check_owns(request.bots)
+        return BotsStopped(count=self._stop(connection, request.bots))
+
+    def _stop(self, connection: Connection, handles: list[int]) -> int:
+        connection.bots.difference_update(handles)
+        return self._bots.stop(np.array(handles, dtype=np.int64)) if handles else 0

@@ -1,0 +1,66 @@
+"""What can be set about a server, and what must not be combined.
+
+This module knows nothing about how any of it is used; `python -m server --help` is made from it.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Serve one bundle over HTTP and, where asked for, over TCP and a Unix socket."""
+
+    bundle: Path
+    """Folder of the bundle to serve."""
+    host: str = "127.0.0.1"
+    """Address to listen on, for HTTP and TCP."""
+    port: int = 8000
+    """HTTP port; 0 lets the system pick one (see ready-file)."""
+    tcp_port: int | None = None
+    """Port of the length-prefixed stream; 0 lets the system pick one. Not served unless given."""
+    uds: Path | None = None
+    """Path of the Unix socket of the same stream. Not served unless given."""
+    max_bots: int = 256
+    """Bots at any time, over all connections."""
+    max_connections: int = 64
+    """Connections at any time, and open stream sockets."""
+    max_queue: int = 64
+    """Requests that wait for the inference thread; those beyond are refused with NOT_READY."""
+    idle_ttl_s: float = 60.0
+    """A connection that is silent for this long ends, and its bots with it."""
+    frame_deadline_s: float = 3.0
+    """A client has this long to send one whole request, and to take one whole reply."""
+    drain_s: float = 5.0
+    """After SIGTERM, requests in progress have this long to finish."""
+    token: str | None = None
+    """What Hello must carry. Required unless the host is a loopback address."""
+    insecure_no_token: bool = False
+    """Listen on other than loopback addresses without a token: for networks that only trusted machines are on."""
+    ready_file: Path | None = None
+    """Written once everything listens: JSON of the addresses (`http`, `tcp`, `unix`) and `pid`. Removed at the end."""
+
+    def __post_init__(self) -> None:
+        if min(self.max_bots, self.max_connections, self.max_queue) < 1:
+            raise ValueError("max_bots, max_connections and max_queue must be at least 1")
+        if min(self.idle_ttl_s, self.frame_deadline_s, self.drain_s) <= 0:
+            raise ValueError("idle_ttl_s, frame_deadline_s and drain_s must be positive")
+        if self.token == "":
+            raise ValueError("the token must not be empty")
+        if self.token is None and not self.insecure_no_token and not _is_loopback(self.host):
+            raise ValueError(
+                f"refusing to listen on {self.host} without a token: anyone could take every bot. "
+                "Give --token, or --insecure-no-token if only trusted machines reach this network."
+            )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
