@@ -1,7 +1,8 @@
-"""One tiny bundle for the whole room, and an engine that plays any bots with values drawn from a seed."""
+"""One tiny bundle for the whole room, an engine that plays any bots, and a policy that can be spoilt."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
+from bot_runtime.policy import Policy, Step
 from bot_runtime.turns import Actions, Queries
 from protocol.features import FeatureTable
 from tests.bundles import make_bundle
@@ -59,9 +61,36 @@ class Engine:
         return random.uniform(low, high, (n_bots, low.size)).astype(np.float32)
 
 
+class Poisoned:
+    """A policy whose output is spoilt for some rows of the batch, for as long as the test says."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self.probs: dict[int, float] = {}
+        self.step: dict[int, tuple[str, float]] = {}
+
+    def query_probs(self, *arrays: np.ndarray) -> np.ndarray:
+        probs = self._policy.query_probs(*arrays).copy()
+        for row, number in self.probs.items():
+            probs[row, -1] = number
+        return probs
+
+    def act(self, *arrays: np.ndarray) -> Step:
+        step = Step(*(array.copy() for array in self._policy.act(*arrays)))
+        for row, (field, number) in self.step.items():
+            array = getattr(step, field)
+            (array[:, row] if field.startswith("new") else array[row])[..., -1] = number
+        return step
+
+
 @pytest.fixture(scope="session")
 def bundle_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_bundle(tmp_path_factory.mktemp("bundles") / "tiny")
+
+
+@pytest.fixture
+def copy(bundle_path: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(bundle_path, tmp_path / "copy"))
 
 
 @pytest.fixture(scope="session")
@@ -72,3 +101,9 @@ def bundle(bundle_path: Path) -> Bundle:
 @pytest.fixture
 def engine(bundle: Bundle) -> Engine:
     return Engine(Bots(bundle, max_bots=8))
+
+
+@pytest.fixture
+def poisoned(engine: Engine) -> Poisoned:
+    engine.bots._policy = Poisoned(engine.bots._policy)
+    return engine.bots._policy

@@ -1,0 +1,227 @@
+"""A bundle loads, or BadBundle says what is wrong with it; nothing else ever comes out of the loader."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from bot_runtime import bundle as bundle_module
+from bot_runtime.bundle import Bundle
+from bot_runtime.manifest import FILES
+from protocol.errors import BadBundle
+from tests.bundles import make_bundle, rehash
+
+
+def change_manifest(path: Path, **fields: object) -> None:
+    manifest = msgspec.json.decode((path / "manifest.json").read_bytes())
+    (path / "manifest.json").write_bytes(msgspec.json.encode({**manifest, **fields}))
+
+
+def change_golden(path: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
+    with np.load(path / "golden.npz") as archive:
+        arrays = dict(archive)
+    change(arrays)
+    np.savez(path / "golden.npz", **arrays)
+    rehash(path)
+
+
+@pytest.mark.parametrize(
+    "shape", [{}, {"context_length": 2, "n_layers": 1, "n_heads": 1, "head_dim": 3}, {"context_length": 7, "seed": 9}]
+)
+def test_loads(tmp_path: Path, shape: dict[str, int]) -> None:
+    loaded = Bundle.load(make_bundle(tmp_path / "tiny", **shape))
+    assert loaded.name == "tiny"
+    assert loaded.manifest.budget_us == pytest.approx(0.5 * (1.25 + 2.5 + 7.1 + 11.3 + 0.3))
+
+
+def test_other_files_are_ignored(copy: Path) -> None:
+    (copy / "config.json").write_text("{")
+    (copy / "policy.pkl").write_bytes(b"\x80\x04.")
+    Bundle.load(copy)
+
+
+@pytest.mark.parametrize("file", ["manifest.json", *FILES])
+def test_missing_linked_or_not_a_file(copy: Path, file: str) -> None:
+    target = copy / file
+    content = target.read_bytes()
+    target.unlink()
+    with pytest.raises(BadBundle, match=file):
+        Bundle.load(copy)
+    elsewhere = copy / "elsewhere"
+    elsewhere.write_bytes(content)
+    target.symlink_to(elsewhere)
+    with pytest.raises(BadBundle, match=file):
+        Bundle.load(copy)
+    target.unlink()
+    os.mkfifo(target)  # opening it must not wait for a writer
+    with pytest.raises(BadBundle, match=f"{file} is not a regular file"):
+        Bundle.load(copy)
+    target.unlink()
+    target.mkdir()
+    with pytest.raises(BadBundle, match=file):
+        Bundle.load(copy)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"schema_version": 2},
+        {"name": "../evil"},
+        {"name": "Tiny"},
+        {"name": "tiny\n"},
+        {"name": "a" * 65},
+        {"method": "iql"},
+        {"context_length": 1},
+        {"context_length": 10**6},
+        {"n_layers": 0},
+        {"head_dim": 65537},
+        {"n_layers": 60000, "n_heads": 60000},
+        {"budget": 1.5},
+        {"budget": None},
+        {"tolerance": 1.0},
+        {"tolerance": 0.0},
+        {"files": {}},
+        {"files": {"../x": {"sha256": "0" * 64, "bytes": 1}}},
+        {"files": {file: {"sha256": "xyz", "bytes": 1} for file in FILES}},
+        {"surprise": 1},
+        {"features": {"features": []}},
+        {"action": {"components": []}},
+    ],
+    ids=lambda fields: "-".join(fields),
+)
+def test_illegal_manifest(copy: Path, fields: dict[str, object]) -> None:
+    change_manifest(copy, **fields)
+    with pytest.raises(BadBundle, match=r"manifest\.json"):
+        Bundle.load(copy)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[" * 10**6, b"\xff\xfe", b" " * (2**20 + 1)])
+def test_manifest_that_is_not_json(copy: Path, content: bytes) -> None:
+    (copy / "manifest.json").write_bytes(content)
+    with pytest.raises(BadBundle, match=r"manifest\.json"):
+        Bundle.load(copy)
+
+
+@pytest.mark.parametrize("field", ["width", "context_length", "n_heads", "n_layers", "head_dim"])
+def test_graphs_of_other_sizes_than_the_manifest_says(copy: Path, field: str) -> None:
+    manifest = msgspec.json.decode((copy / "manifest.json").read_bytes())
+    change_manifest(copy, **{field: manifest[field] + 1})
+    with pytest.raises(BadBundle, match="expected"):
+        Bundle.load(copy)
+
+
+def test_any_damaged_byte_is_refused_before_parsing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """10,000 mutations are the long form; hashes make each byte equal, so a few hundred places do."""
+
+    def parse(*_: object) -> None:
+        raise AssertionError("parsed before its hash was checked")
+
+    for reader in ("check_graph", "read_golden", "Policy"):
+        monkeypatch.setattr(bundle_module, reader, parse)
+    random = np.random.default_rng(0)
+    for file in FILES:
+        content = (copy / file).read_bytes()
+        for place in random.integers(0, len(content), 60):
+            damaged = bytearray(content)
+            damaged[place] ^= 1 << int(random.integers(8))
+            (copy / file).write_bytes(damaged)
+            with pytest.raises(BadBundle, match=f"{file} has sha256"):
+                Bundle.load(copy)
+        for wrong in (content[:-1], content + b"\0", b""):
+            (copy / file).write_bytes(wrong)
+            with pytest.raises(BadBundle, match=f"{file} has {len(wrong)} bytes"):
+                Bundle.load(copy)
+        (copy / file).write_bytes(content)
+
+
+def test_larger_than_any_bundle(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bundle_module, "MAX_FILE_BYTES", 100)
+    with pytest.raises(BadBundle, match="more than 100 bytes"):
+        Bundle.load(copy)
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_mutated_and_rehashed_is_loaded_or_refused(copy: Path, bundle_path: Path, data: st.DataObject) -> None:
+    """An author with the hashes on their side still gets a bundle or a BadBundle, never another exception."""
+    file = data.draw(st.sampled_from(FILES))
+    content = bytearray((bundle_path / file).read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    shutil.copytree(bundle_path, copy, dirs_exist_ok=True)
+    (copy / file).write_bytes(content[: data.draw(st.integers(1, len(content)))])
+    rehash(copy)
+    with contextlib.suppress(BadBundle):
+        Bundle.load(copy)
+
+
+@pytest.mark.parametrize("name", ["probs", "actions", "hidden"])
+def test_golden_replay_notices_a_difference(copy: Path, name: str) -> None:
+    def nudge(arrays: dict[str, np.ndarray]) -> None:
+        arrays[name][-1, -1] += 3e-4
+
+    change_golden(copy, nudge)
+    with pytest.raises(BadBundle, match=f"{name} of turn 13 differ"):
+        Bundle.load(copy)
+    Bundle.load(copy, replay=False)
+
+
+@pytest.mark.parametrize("name", ["free", "costly", "rewards", "queries", "seed", "target_return"])
+def test_golden_replay_reads_every_input(copy: Path, name: str) -> None:
+    def nudge(arrays: dict[str, np.ndarray]) -> None:
+        if name == "queries":
+            arrays[name][0] ^= 1
+        elif name == "costly":
+            arrays[name][arrays["queries"].any(axis=1)] += 1.0
+        else:
+            arrays[name] = arrays[name] + arrays[name].dtype.type(1)
+
+    change_golden(copy, nudge)
+    with pytest.raises(BadBundle, match="golden replay"):
+        Bundle.load(copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda arrays: arrays.pop("hidden"), "holds"),
+        (lambda arrays: arrays.update(extra=np.zeros(1)), "holds"),
+        (lambda arrays: arrays.update(probs=arrays["probs"][:, 1:]), "probs has shape"),
+        (lambda arrays: arrays["free"].__setitem__((0, 0), np.nan), "free is float32, expected finite"),
+        (lambda arrays: arrays["queries"].__setitem__((0, 0), 2), "other numbers than 0 and 1"),
+        (lambda arrays: arrays.update({k: v[:4] for k, v in arrays.items() if v.ndim}), "4 turns, expected more"),
+        (lambda arrays: arrays.update(seed=np.array("x")), "seed is <U1"),
+    ],
+)
+def test_illegal_golden(copy: Path, change: Callable[[dict[str, np.ndarray]], None], match: str) -> None:
+    change_golden(copy, change)
+    with pytest.raises(BadBundle, match=match):
+        Bundle.load(copy)
+
+
+def test_no_pickle_in_golden(copy: Path) -> None:
+    np.savez(copy / "golden.npz", seed=np.array([print], dtype=object))
+    rehash(copy)
+    with pytest.raises(BadBundle, match="plain arrays"):
+        Bundle.load(copy)
+
+
+def test_zip_bomb_in_golden(copy: Path) -> None:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("free.npy", b"\0" * (65 * 2**20))
+    (copy / "golden.npz").write_bytes(packed.getvalue())
+    rehash(copy)
+    with pytest.raises(BadBundle, match="unpacks to"):
+        Bundle.load(copy)

@@ -1,0 +1,97 @@
+"""Graphs that do what no bundle may do are refused, though their hashes are right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from bot_runtime.bundle import Bundle
+from protocol.errors import BadBundle
+from tests.bundles import rehash
+
+
+def change_graph(path: Path, file: str, change: Callable[[onnx.ModelProto], None]) -> None:
+    model = onnx.load(path / file)
+    change(model)
+    (path / file).write_bytes(model.SerializeToString())
+    rehash(path)
+
+
+def rename_input(model: onnx.ModelProto) -> None:
+    for node in model.graph.node:
+        node.input[:] = ["observed" if name == "free" else name for name in node.input]
+    next(port for port in model.graph.input if port.name == "free").name = "observed"
+
+
+def freeze_batch(model: onnx.ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
+
+
+def use_a_loop(model: onnx.ModelProto) -> None:
+    body = helper.make_graph([], "body", [], [])
+    model.graph.node.append(helper.make_node("Loop", ["", ""], ["looped"], body=body))
+
+
+def use_a_subgraph_in_an_allowed_op(model: onnx.ModelProto) -> None:
+    body = helper.make_graph([], "body", [], [])
+    model.graph.node.append(helper.make_node("Identity", ["free"], ["same"], body=body))
+
+
+def use_another_domain(model: onnx.ModelProto) -> None:
+    model.graph.node[0].domain = "com.microsoft"
+
+
+def use_random_numbers(model: onnx.ModelProto) -> None:
+    model.graph.node.append(helper.make_node("RandomNormal", [], ["drawn"], shape=[1]))
+
+
+def keep_weights_outside(model: onnx.ModelProto) -> None:
+    tensor = model.graph.initializer[0]
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="/etc/hostname")
+
+
+def keep_a_constant_outside(model: onnx.ModelProto) -> None:
+    tensor = TensorProto(name="t", data_type=TensorProto.FLOAT, dims=[1], data_location=TensorProto.EXTERNAL)
+    tensor.external_data.add(key="location", value="weights.bin")
+    model.graph.node.append(helper.make_node("Constant", [], ["outside"], value=tensor))
+
+
+def use_a_function(model: onnx.ModelProto) -> None:
+    model.functions.add(name="f", domain="local")
+
+
+def divide_by_zero(model: onnx.ModelProto) -> None:
+    zero = helper.make_node("Sub", [model.graph.node[-1].input[0]] * 2, ["zero"])
+    model.graph.node.insert(len(model.graph.node) - 1, zero)
+    model.graph.node[-1].input[0] = "infinite"
+    model.graph.node.insert(len(model.graph.node) - 1, helper.make_node("Div", ["zero", "zero"], ["infinite"]))
+
+
+@pytest.mark.parametrize("file", ["acquisition.onnx", "action.onnx"])
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (rename_input, "has inputs"),
+        (freeze_batch, "has shape"),
+        (use_a_loop, "operator 'Loop'|a subgraph"),
+        (use_a_subgraph_in_an_allowed_op, "a subgraph"),
+        (use_another_domain, "domain 'com.microsoft'"),
+        (use_random_numbers, "operator 'RandomNormal'"),
+        (keep_weights_outside, "another file"),
+        (keep_a_constant_outside, "another file"),
+        (use_a_function, "local functions"),
+        (divide_by_zero, "differ by nan"),
+        (lambda model: model.ClearField("graph"), "holds 0 graphs"),
+        (lambda model: model.graph.ClearField("node"), "does not load"),
+    ],
+)
+def test_illegal_graph(copy: Path, file: str, change: Callable[[onnx.ModelProto], None], match: str) -> None:
+    change_graph(copy, file, change)
+    with pytest.raises(BadBundle, match=match):
+        Bundle.load(copy)
