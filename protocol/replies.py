@@ -81,8 +81,10 @@ def read_welcome(reply: dict[str, Any]) -> Welcome:
         return Welcome(
             connection=str(reply["connection"]),
             bundle=str(reply["bundle"]),
-            features=FeatureTable(tuple(Feature(**feature) for feature in reply["features"]["features"])),
-            action=ActionSpec(tuple(ActionComponent(**component) for component in reply["action"]["components"])),
+            features=FeatureTable(tuple(Feature(**_known(Feature, each)) for each in reply["features"]["features"])),
+            action=ActionSpec(
+                tuple(ActionComponent(**_known(ActionComponent, each)) for each in reply["action"]["components"])
+            ),
             cost_model=CostModel(reply["cost_model"]["call_us"], tuple(reply["cost_model"]["feature_us"])),
             budget_us=float(reply["budget_us"]),
             context_length=int(reply["context_length"]),
@@ -106,6 +108,11 @@ def read_actions(reply: dict[str, Any], bots: int, action: ActionSpec) -> Action
         actions_NA = np.frombuffer(reply["actions"], dtype="<f4").reshape(bots, action.size)
         reasons_N = np.array(reply["reasons"], dtype=np.uint8).reshape(bots)
         return Actions(int(reply["frame"]), actions_NA, reasons_N, float(reply["infer_us"]))
+
+
+def _known(kind: type[Feature | ActionComponent], fields: dict[str, Any]) -> dict[str, Any]:
+    """A newer server may say more than this client knows."""
+    return {name: fields[name] for name in kind.__struct_fields__}
 
 
 @contextmanager
