@@ -57,7 +57,7 @@ class StreamDoor:
                 return
             self._open[socket] = task
             await self._converse(socket)
-        except (OSError, TimeoutError, asyncio.IncompleteReadError):
+        except (OSError, asyncio.IncompleteReadError):
             pass  # the client went away or was too slow: there is nobody to tell
         finally:
             self._open.pop(socket, None)
@@ -66,10 +66,13 @@ class StreamDoor:
             await socket.close()
 
     async def drain(self, timeout_s: float) -> None:
-        """Close idle sockets, let requests in progress be answered for at most `timeout_s`, close what is left."""
+        """Close the sockets that no whole request came from, let requests in progress be answered, close the rest.
+
+        Waits for at most `timeout_s`.
+        """
         self._draining = True
         for socket in self._open:
-            if socket.idle:
+            if socket.receiving:
                 socket.abort()
         if self._open:
             _, late = await asyncio.wait(self._open.values(), timeout=timeout_s)
@@ -108,19 +111,20 @@ class _Socket:
         self._writer = writer
         self._deadline_s = deadline_s
         self.connection: str | None = None
-        self.idle = False
+        self.receiving = False
 
     async def receive(self, silence_s: float, limit: int) -> bytes:
         """The next frame's body. Raises TooLarge, TimeoutError, IncompleteReadError where the client closed."""
-        self.idle = True
+        self.receiving = True
         async with asyncio.timeout(silence_s):
             first = await self._reader.readexactly(1)
-        self.idle = False
         async with asyncio.timeout(self._deadline_s):
             (size,) = _PREFIX.unpack(first + await self._reader.readexactly(_PREFIX.size - 1))
             if size > limit:
                 raise TooLarge(f"the frame has {size} bytes, the limit is {limit}")
-            return await self._reader.readexactly(size)
+            body = await self._reader.readexactly(size)
+        self.receiving = False
+        return body
 
     async def send(self, body: bytes) -> None:
         """Send one frame; raises TimeoutError when the client does not read its replies."""

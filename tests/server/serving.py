@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -116,7 +116,11 @@ class RawStream:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.socket.close()
+        """Close, and wait until the server has: what it does afterwards then comes after the end of this connection."""
+        with self.socket, suppress(OSError):
+            self.socket.shutdown(socket.SHUT_WR)
+            while self.socket.recv(65536):
+                pass
 
     def frame(self, body: bytes) -> dict[str, Any]:
         self.socket.sendall(struct.pack(">I", len(body)) + body)

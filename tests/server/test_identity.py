@@ -105,6 +105,7 @@ def test_a_socket_that_just_closes_frees_its_bots(served: Served) -> None:
         with RawStream(served.addresses["tcp"]) as raw:
             raw.frame(VECTORS["hello"].body)
             assert _until_started(raw)
+            raw.socket.close()
 
 
 def _until_started(raw: RawStream) -> bool:

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import pytest
+
+from protocol.errors import BadSchema, NoBot, NoConnection, TooManyConnections
+from protocol.features import CostModel
+from server.connections import Connections
+from tests.server.serving import FakeClock
+
+COSTS = CostModel(0.0, (1.0,))
+
+
+def test_silence_is_measured_by_the_given_clock_and_any_request_breaks_it() -> None:
+    clock = FakeClock()
+    connections = Connections(max_connections=3, idle_ttl_s=10.0, clock=clock)
+    silent, talking = connections.open(COSTS), connections.open(COSTS)
+    for _ in range(5):
+        clock.now += 6.0
+        assert connections.get(talking.id) is talking
+    with pytest.raises(NoConnection):
+        connections.get(silent.id)
+    assert connections.remove_silent() == [silent]
+    assert connections.remove_silent() == []
+    assert len(connections) == 1
+
+
+def test_limits_and_names() -> None:
+    connections = Connections(max_connections=1, idle_ttl_s=10.0, clock=FakeClock())
+    only = connections.open(COSTS)
+    with pytest.raises(TooManyConnections):
+        connections.open(COSTS)
+    for name in (None, "", "0" * 32, only.id.upper() + "x"):
+        with pytest.raises(NoConnection):
+            connections.get(name)
+    assert connections.remove(only.id) is only
+    assert connections.remove(only.id) is None
+    assert connections.open(COSTS).id != only.id
+
+
+def test_a_connection_names_its_own_bots_once_each() -> None:
+    connection = Connections(1, 10.0, FakeClock()).open(COSTS)
+    connection.bots.update({3, 4})
+    connection.check_owns([4, 3])
+    with pytest.raises(NoBot, match="5"):
+        connection.check_owns([3, 5])
+    with pytest.raises(BadSchema):
+        connection.check_owns([3, 3])
