@@ -15,7 +15,7 @@ from protocol import messages
 from protocol.codec import Format
 from protocol.errors import ERRORS_BY_CODE
 
-__all__ = ["ROUTES", "describe", "document", "summary"]
+__all__ = ["ROUTES", "document", "summary"]
 
 ROUTES: dict[str, tuple[type[messages.Request], type[messages.Reply]]] = {
     "/v1/connections": (messages.Hello, messages.Welcome),
@@ -25,34 +25,43 @@ ROUTES: dict[str, tuple[type[messages.Request], type[messages.Reply]]] = {
     "/v1/bots/stop": (messages.StopBots, messages.BotsStopped),
     "/v1/connections/close": (messages.Goodbye, messages.Farewell),
 }
+_CONNECTION = {
+    "name": "X-Bot-Connection",
+    "in": "header",
+    "required": True,
+    "description": "The `connection` of Welcome.",
+    "schema": {"type": "string"},
+}
 _REF = "#/components/schemas/{name}"
 
 
-def describe(request: type[messages.Request], reply: type[messages.Reply]) -> dict[str, Any]:
-    """The OpenAPI operation of one message route."""
-    refusals = {str(error.status): error for error in ERRORS_BY_CODE.values()}
-    return {
-        "requestBody": {"required": True, "content": _content(request)},
-        "responses": {
-            "200": {"description": reply.__name__, "content": _content(reply)},
-            **{
-                status: {"description": _codes(int(status)), "content": _content(messages.Error)}
-                for status in sorted(refusals)
-            },
-        },
-    }
-
-
 def document(app: FastAPI) -> None:
-    """Add the schemas that `describe` refers to to the application's OpenAPI document."""
+    """Add the message routes and their schemas to the application's OpenAPI document."""
     draw = app.openapi
 
     def openapi() -> dict[str, Any]:
         drawn = draw()
+        drawn["paths"].update({path: {"post": _operation(*pair)} for path, pair in ROUTES.items()})
         drawn.setdefault("components", {}).setdefault("schemas", {}).update(_schemas())
         return drawn
 
     app.openapi = openapi  # type: ignore[method-assign]  # FastAPI's documented way to extend the document
+
+
+def _operation(request: type[messages.Request], reply: type[messages.Reply]) -> dict[str, Any]:
+    statuses = sorted({error.status for error in ERRORS_BY_CODE.values()})
+    return {
+        "summary": request.__name__,
+        "description": request.__doc__,
+        "parameters": [] if request is messages.Hello else [_CONNECTION],
+        "requestBody": {"required": True, "content": _content(request)},
+        "responses": {
+            "200": {"description": reply.__name__, "content": _content(reply)},
+            **{
+                str(status): {"description": _codes(status), "content": _content(messages.Error)} for status in statuses
+            },
+        },
+    }
 
 
 def _schemas() -> dict[str, Any]:
