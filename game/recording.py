@@ -81,7 +81,7 @@ def merge_shards(
     metadata: dict[str, str],
 ) -> Path:
     """Join shards, in order, into the Minari dataset `root/dataset_id`; returns its folder. `metadata` goes with it."""
-    data = root / dataset_id / "data"
+    data = root.resolve() / dataset_id / "data"  # Minari joins a relative path to itself
     building = data.with_name("building")
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)
