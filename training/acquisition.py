@@ -1,8 +1,9 @@
-"""Sampling queries along a sequence, and their gradients: exactly, without the paper's loop over timesteps.
+"""Sampling queries along a sequence, and their gradients: exactly, without recomputing the past at every timestep.
 
 q_t depends on h_{t-1}, which depends on the queries before t. With the uniform noise u fixed, q = [u < q̃(q)] has one
 fixed point, because the system is causal: after p parallel passes the first p timesteps are final. `sample_queries`
-iterates to it; `sample_queries_sequentially` is the paper's loop, kept as the reference.
+iterates to it; `sample_queries_incrementally` walks to it over a cache; `sample_queries_sequentially` is the paper's
+loop, kept as the reference.
 
 The gradient is causal too. With q a leaf of the graph, ∂L/∂q_t flows on through the straight-through estimator into
 q̃_t, hence into h_{t-1} and earlier queries. `backward` sweeps that adjoint backwards: after p sweeps, paths through
@@ -22,7 +23,14 @@ from torch import Tensor
 from training.models import BudgetedDecisionTransformer
 from training.objectives import straight_through
 
-__all__ = ["Rollout", "backward", "rollout", "sample_queries", "sample_queries_sequentially"]
+__all__ = [
+    "Rollout",
+    "backward",
+    "rollout",
+    "sample_queries",
+    "sample_queries_incrementally",
+    "sample_queries_sequentially",
+]
 
 
 @dataclass(frozen=True)
@@ -49,12 +57,42 @@ def sample_queries(
     if model.config.acquisition != "learned":
         return torch.full_like(uniforms_BTM, float(model.config.acquisition == "all")), 0
     query = (uniforms_BTM < 0.5).to(uniforms_BTM.dtype)
+    open_B = torch.arange(len(query))  # sequences that are not at their fixed point yet
     for passes in range(1, length + 1):
-        probs = rollout(model, context, costly, query).probs_BTM
-        sampled = (uniforms_BTM < probs).to(query.dtype)
-        if torch.equal(sampled, query):
+        probs = rollout(model, context[open_B], costly[open_B], query[open_B]).probs_BTM
+        sampled = (uniforms_BTM[open_B] < probs).to(query.dtype)
+        changed_B = (sampled != query[open_B]).flatten(1).any(1)
+        query[open_B] = sampled
+        open_B = open_B[changed_B]
+        if len(open_B) == 0:
             return query, passes
-        query = sampled
+    return query, length
+
+
+@torch.no_grad()
+def sample_queries_incrementally(
+    model: BudgetedDecisionTransformer, context: Tensor, costly: Tensor, uniforms_BTM: Tensor
+) -> tuple[Tensor, int]:
+    """The same queries, one timestep after another over cached keys and values: each token is computed once.
+
+    Cheaper than parallel passes where a small batch keeps the processor busy (a CPU); the other way round on a GPU.
+    """
+    config, (batch, length, _) = model.config, uniforms_BTM.shape
+    if config.acquisition != "learned":
+        return torch.full_like(uniforms_BTM, float(config.acquisition == "all")), 0
+    shape = (config.n_layers, batch, config.n_heads, length, config.width // config.n_heads)
+    keys, values = context.new_empty(shape), context.new_empty(shape)
+    hidden, query = context.new_zeros(batch, config.width), torch.empty_like(uniforms_BTM)
+    for t in range(length):
+        probs = model.query_probs(hidden, context[:, t])
+        query[:, t] = uniforms_BTM[:, t] < probs
+        x = model.tokens(context[:, t], costly[:, t], query[:, t])
+        span = slice(max(0, t - config.context_length + 1), t)
+        ages = torch.arange(span.stop - span.start, 0, -1)[None]
+        for layer, block in enumerate(model.blocks):
+            x, key, value = block.step(x, keys[layer, :, :, span], values[layer, :, :, span], ages)
+            keys[layer, :, :, t], values[layer, :, :, t] = key, value
+        hidden = model.norm_out(x)
     return query, length
 
 

@@ -26,6 +26,7 @@ class TrainConfig:
     budget: float = 0.1  # C: most that a query may cost, as a share of the full cost (Eq. 1)
     penalty_step: float = 0.001  # ε: what γ rises by after a batch that violated the budget (Alg. 1)
     acquisition_bias: float = 0.0  # initial logit of every query probability
+    sampler: Literal["incremental", "parallel"] = "incremental"  # same queries; parallel passes suit a GPU
     sweeps: int = 2  # backward sweeps of the query's adjoint (training/acquisition.py)
     frame_budget: float = 0.2  # hard cap of one bot's query at run time, unless the engine sets another (bursts pass C)
     target_return: float | None = None  # return asked for at run time (None: 90th percentile of the traces)

@@ -27,6 +27,7 @@ from protocol.features import CostModel
 
 __all__ = ["EvaluateConfig", "Evaluation", "evaluate"]
 
+_UNLIMITED_US = 1e9
 _CHUNK = 16  # episodes that one worker plays at once, as one batch of bots
 
 
@@ -82,7 +83,7 @@ class _Player:
         self._bundle = Bundle.load(config.bundle, replay=False)
         self._costs = CostModel.declared(self._bundle.manifest.features)
         budget = self._bundle.manifest.budget if config.budget is None else config.budget
-        self._budget_us = budget * self._costs.full_us
+        self._budget_us = _UNLIMITED_US if budget == 1.0 else budget * self._costs.full_us
         self._environment = environment
         self._environments: list[gymnasium.Env] = []
 

@@ -23,7 +23,7 @@ import tyro
 from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
-from training.acquisition import Rollout, backward, rollout, sample_queries
+from training.acquisition import Rollout, backward, rollout, sample_queries, sample_queries_incrementally
 from training.checkpoint import Facts, load_checkpoint, save_checkpoint
 from training.config import TrainConfig
 from training.models import BudgetedDecisionTransformer, ModelConfig
@@ -88,7 +88,8 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: torc
     batch = draw_windows(traces, config.batch, config.window, chance)
     context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
     uniforms_BTM = torch.from_numpy(chance.random((*batch.valid_BT.shape, len(costs_M)), dtype=np.float32))
-    query_BTM, passes = sample_queries(model, context, batch.costly_BTD, uniforms_BTM)
+    sample = sample_queries if config.sampler == "parallel" else sample_queries_incrementally
+    query_BTM, passes = sample(model, context, batch.costly_BTD, uniforms_BTM)
     bins_BTA = nearest_bins(batch.actions_BTA, model.config.low, model.config.high, model.config.bins)
     parts: dict[str, float] = {}
 

@@ -7,7 +7,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from training.acquisition import Rollout, backward, rollout, sample_queries, sample_queries_sequentially
+from training.acquisition import (
+    Rollout,
+    backward,
+    rollout,
+    sample_queries,
+    sample_queries_incrementally,
+    sample_queries_sequentially,
+)
 from training.models import BudgetedDecisionTransformer, ModelConfig
 from training.objectives import action_loss, penalty, query_cost
 
@@ -69,6 +76,7 @@ def test_same_noise_same_queries(seed: int, length: int, context_length: int, n_
         reference = sample_queries_sequentially(model, context, costly, uniforms)
     assert torch.equal(query, reference.query_BTM.round())
     assert passes <= length
+    assert torch.equal(sample_queries_incrementally(model, context, costly, uniforms)[0], query)
     assert torch.allclose(rollout(model, context, costly, query).hidden_BTW, reference.hidden_BTW, atol=1e-5)
 
 
