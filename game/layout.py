@@ -18,6 +18,7 @@ __all__ = ["Layout", "draw_layout", "open_stretches"]
 _DRAWS = 200
 _CLEAR_OF_TRIP_M = 3.0
 _BETWEEN_POOLS_M = 3.0
+_SHORTEST_TRIP_M = 5.0
 _BESIDE_BLOCK_M = 1.0
 _SAFE_M = 0.9
 
@@ -69,6 +70,8 @@ def open_stretches(river: River, crossable: tuple[bool, ...]) -> list[Rect]:
 def _draw(terrain: Terrain, rng: np.random.Generator) -> Layout | None:
     trip = terrain.trips[rng.integers(len(terrain.trips))]
     start, goal = _point(trip.start, rng), _point(trip.goal, rng)
+    if math.dist(start, goal) < _SHORTEST_TRIP_M:
+        return None
     yaw = math.atan2(goal[1] - start[1], goal[0] - start[0]) + rng.uniform(-1.0, 1.0)
     bridges = []
     for river in terrain.rivers:

@@ -123,6 +123,9 @@ def _check(terrain: Terrain) -> None:
         for slot in river.slots:
             if not _crosses(slot, river.rect):
                 raise MapError(f"map {terrain.name}: slot {slot} does not cross its river {river.rect} bank to bank")
+    for pools in terrain.pools:
+        if min(pools.zone[2] - pools.zone[0], pools.zone[3] - pools.zone[1]) < pools.size_m:
+            raise MapError(f"map {terrain.name}: pool zone {pools.zone} is too small for pools of {pools.size_m} m")
     deadly = [hazard.rect for hazard in terrain.hazards] + [river.rect for river in terrain.rivers]
     for trip in terrain.trips:
         for block in (*deadly, *(wall.rect for wall in terrain.walls), *(ledge.rect for ledge in terrain.ledges)):

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from game.collect import Collect, collect, dataset_id
+from game.collect import Collect, collect, dataset_id, play_episode
 from game.env import ACTION_SPEC, feature_table
+from game.players import Player
 from game.recording import summarise, write_shard
+from game.skills import EXPERT
 from protocol.features import ActionSpec, FeatureTable
 
 
@@ -102,3 +104,15 @@ def test_a_shard_appears_only_when_it_is_complete(tmp_path):
     with pytest.raises(RuntimeError, match="no episode"):
         write_shard(tmp_path / "shard.hdf5", broken())
     assert not (tmp_path / "shard.hdf5").exists()
+
+
+def test_what_was_intended_is_recorded_not_what_a_kick_made_of_it(easy, monkeypatch):
+    player = Player(EXPERT, easy.terrain)
+    intended, executed = [], []
+    act, step = player.act, easy.step
+    monkeypatch.setattr(player, "act", lambda character: intended.append(act(character)) or intended[-1])
+    monkeypatch.setattr(easy, "step", lambda action: executed.append(action) or step(action))
+    episode = play_episode(easy, player, seed=0, kick_chance=0.2)
+    np.testing.assert_array_equal(episode.actions, np.stack(intended))
+    kicked = (np.stack(executed) != episode.actions).any(axis=1)
+    assert 0.05 < kicked.mean() < 0.9

@@ -68,3 +68,13 @@ def test_a_map_that_cannot_be_crossed_is_the_maps_fault():
     cut = type(terrain)(**{**{name: getattr(terrain, name) for name in terrain.__struct_fields__}, "walls": (wall,)})
     with pytest.raises(MapError, match="no goal could be reached"):
         draw_layout(cut, np.random.default_rng(0))
+
+
+def test_start_and_goal_are_never_the_same_place():
+    terrain = load_map("easy")
+    trip = type(terrain.trips[0])((-28.0, -5.0, -20.0, 5.0), (-28.0, -5.0, -20.0, 5.0))
+    fields = {name: getattr(terrain, name) for name in terrain.__struct_fields__}
+    near = type(terrain)(**{**fields, "trips": (trip,)})
+    for seed in _SEEDS:
+        layout = draw_layout(near, np.random.default_rng(seed))
+        assert math.dist(layout.start, layout.goal) >= 5.0

@@ -50,6 +50,7 @@ def _with(key, value):
         (_with("ledges", [{"rect": [-10, 0, 1, 1], "height_m": 0.6}]), "stands in lava or water"),
         (_with("hazards", [{"kind": "acid", "rect": [0, 0, 1, 1]}]), "acid"),
         (_with("hazards", [{"kind": "lava", "rect": [-36, 0, -20, 10]}]), "start or goal"),
+        (_with("pools", [{"zone": [-3, -3, 0, 3], "size_m": 4, "count": 1}]), "too small"),
         (lambda document: document["rivers"][0].update(standing=7), "7 bridges"),
         (lambda document: document["rivers"][0]["slots"].append([-14, 0, -9, 1]), "bank to bank"),
     ],
