@@ -6,6 +6,8 @@ the past: cached keys and values, the last hidden state, return-to-go, and the c
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,7 +81,7 @@ class Contexts:
         if slots_N.size == capacity and bool((slots_N[1:] > slots_N[:-1]).all()):  # all rows, in order
             return Cache(self._keys, self._values)
         shape = (layers, slots_N.size, *rest)
-        keys, values = (row[: np.prod(shape)].reshape(shape) for row in self._gathered)
+        keys, values = (row[: math.prod(shape)].reshape(shape) for row in self._gathered)
         # mode="clip" writes straight into `out` (slots are always valid); "raise" would buffer it.
         np.take(self._keys, slots_N, axis=1, out=keys, mode="clip")
         np.take(self._values, slots_N, axis=1, out=values, mode="clip")
