@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -22,7 +23,7 @@ from protocol.features import CostModel
 __all__ = ["LiveView"]
 
 _REDRAW_S = 0.2
-_BAR = 10
+_BAR = 8
 
 
 class LiveView:
@@ -60,7 +61,11 @@ class LiveView:
         for episode in ended:
             self._done.append(episode)
             if self._live is None:
-                self._console.print(f"{self.done:3} of {self._of}: seed {episode.seed} {self._outcome(episode)}")
+                spent_pct = 100.0 * self._costs.query_cost_us(episode.queries).mean() / self._costs.full_us
+                self._console.print(
+                    f"{self.done:3} of {self._of}: seed {episode.seed} {episode.ending}, return {episode.total:.1f}, "
+                    f"{episode.turns} frames, {spent_pct:.1f} % of rays"
+                )
         if self._live is not None and time.monotonic() - self._drawn_at > _REDRAW_S:
             self._drawn_at = time.monotonic()
             self._live.update(self._table(), refresh=True)
@@ -68,13 +73,16 @@ class LiveView:
     def _table(self) -> Table:
         totals = [episode.total for episode in self._done]
         mean = f", mean return {np.mean(totals):.1f}" if totals else ""
-        table = Table(title=f"{self.done} of {self._of} episodes over {self.door}{mean}", min_width=98)
-        for heading in ("bot", "episode", "frame", "goal m", "rays", "µs", f"of {self._budget_us:.1f} µs"):
-            table.add_column(heading, justify="left" if heading.startswith("of") else "right")
-        table.add_column("state")
-        table.add_column("last episode", min_width=44)
+        table = Table(
+            title=f"{self.done} of {self._of} episodes over {self.door}{mean}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+        )
+        for heading in ("bot", "episode", "frame", "goal m", "rays", "µs"):
+            table.add_column(heading, justify="right")
+        for heading in (f"of {self._budget_us:.1f}", "state", "last episode"):
+            table.add_column(heading, no_wrap=True)
         for number, bot in enumerate(self._squad):
-            table.add_row(str(number), *self._cells(bot), "" if bot.last is None else self._outcome(bot.last))
+            last = "" if bot.last is None else f"{bot.last.ending}, {bot.last.total:.1f}"
+            table.add_row(str(number), *self._cells(bot), last)
         return table
 
     def _cells(self, bot: Bot) -> list[str]:
@@ -87,7 +95,3 @@ class LiveView:
             f"{spent_us:.1f}", "█" * full + "░" * (_BAR - full),
             "walking" if bot.env.world.character.on_ground else "in the air",
         ]  # fmt: skip
-
-    def _outcome(self, episode: Episode) -> str:
-        spent_pct = 100.0 * self._costs.query_cost_us(episode.queries).mean() / self._costs.full_us
-        return f"{episode.ending}, return {episode.total:.1f}, {episode.turns} frames, {spent_pct:.1f} % of rays"

@@ -47,6 +47,7 @@ def draw_picture(
     map_axes, ray_axes, cost_axes = panels["map"], panels["rays"], panels["cost"]
     _draw_map(map_axes, terrain, shown)
     _draw_paths(map_axes, episodes, shown, cost_us_T / max(budget_us, 1e-9))
+    _explain(map_axes, terrain, shown)
     _draw_rays(ray_axes, shown)
     _draw_costs(cost_axes, cost_us_T, budget_us, costs.full_us)
     for axes in (ray_axes, cost_axes):
@@ -98,18 +99,25 @@ def _draw_paths(axes: Axes, episodes: Sequence[Episode], shown: Episode, share_T
     )
     axes.plot(*shown.layout.start, "o", color="white", markeredgecolor="black", markersize=10, zorder=7)
     axes.plot(*shown.layout.goal, "*", color="#F0E442", markeredgecolor="black", markersize=18, zorder=7)
-    axes.set_title(f"From above: episode {shown.seed} ({shown.ending}), with its own bridges and pools", fontsize=11)
+
+
+def _explain(axes: Axes, terrain: Terrain, shown: Episode) -> None:
+    drawn = ", with its own bridges and pools" if terrain.rivers or terrain.pools else ""
+    axes.set_title(f"From above: episode {shown.seed} ({shown.ending}){drawn}", fontsize=11)
+    bridges = [
+        Patch(label="standing bridge", **_BRIDGE),
+        Patch(label="missing bridge", facecolor="#999999", edgecolor="white", linewidth=1.8, linestyle=_DASHES),
+    ]
     marks = {"linestyle": "none", "markeredgecolor": "black"}
     handles = [
         Line2D([], [], marker="o", color="white", markersize=9, label="start", **marks),
         Line2D([], [], marker="*", color="#F0E442", markersize=14, label="goal", **marks),
         Line2D([], [], color=_PATH, marker="o", markerfacecolor="#CC79A7", label="path, dot area: µs of rays"),
-        Line2D([], [], color="#777777", label="other episodes, other bridges"),
+        Line2D([], [], color="#777777", label="other episodes" + (", other bridges" if terrain.rivers else "")),
         Line2D([], [], marker="x", color="black", label="died", **marks),
         Line2D([], [], marker="s", color="black", label="timed out", **marks),
         *(Patch(label=kind, **style) for kind, style in _DEADLY.items()),
-        Patch(label="standing bridge", **_BRIDGE),
-        Patch(label="missing bridge", facecolor="#999999", edgecolor="white", linewidth=1.8, linestyle=_DASHES),
+        *(bridges if terrain.rivers else []),
         Patch(label="ledge", facecolor=_LEDGE, edgecolor="#8a7a55"),
         Patch(label="wall", facecolor=_WALL),
     ]
