@@ -47,7 +47,7 @@ def draw_picture(
     map_axes, ray_axes, cost_axes = panels["map"], panels["rays"], panels["cost"]
     _draw_map(map_axes, terrain, shown)
     _draw_paths(map_axes, episodes, shown, cost_us_T / max(budget_us, 1e-9))
-    _explain(map_axes, terrain, shown)
+    _explain(figure, terrain)
     _draw_rays(ray_axes, shown)
     _draw_costs(cost_axes, cost_us_T, budget_us, costs.full_us)
     for axes in (ray_axes, cost_axes):
@@ -79,6 +79,8 @@ def _draw_map(axes: Axes, terrain: Terrain, shown: Episode) -> None:
                 _add(axes, slot, facecolor="none", edgecolor="white", linewidth=1.8, linestyle=_DASHES)
     for wall in terrain.walls:
         _add(axes, wall.rect, facecolor=_WALL, edgecolor=_WALL)
+    drawn = ", with its own bridges and pools" if terrain.rivers or terrain.pools else ""
+    axes.set_title(f"From above: episode {shown.seed} ({shown.ending}){drawn}", fontsize=11)
     axes.set_xlim(-half_x - 1, half_x + 1)
     axes.set_ylim(-half_y - 1, half_y + 1)
     axes.set_aspect("equal")
@@ -101,9 +103,7 @@ def _draw_paths(axes: Axes, episodes: Sequence[Episode], shown: Episode, share_T
     axes.plot(*shown.layout.goal, "*", color="#F0E442", markeredgecolor="black", markersize=18, zorder=7)
 
 
-def _explain(axes: Axes, terrain: Terrain, shown: Episode) -> None:
-    drawn = ", with its own bridges and pools" if terrain.rivers or terrain.pools else ""
-    axes.set_title(f"From above: episode {shown.seed} ({shown.ending}){drawn}", fontsize=11)
+def _explain(figure: Figure, terrain: Terrain) -> None:
     bridges = [
         Patch(label="standing bridge", **_BRIDGE),
         Patch(label="missing bridge", facecolor="#999999", edgecolor="white", linewidth=1.8, linestyle=_DASHES),
@@ -121,8 +121,8 @@ def _explain(axes: Axes, terrain: Terrain, shown: Episode) -> None:
         Patch(label="ledge", facecolor=_LEDGE, edgecolor="#8a7a55"),
         Patch(label="wall", facecolor=_WALL),
     ]
-    axes.legend(
-        handles=handles, ncols=6, loc="upper center", bbox_to_anchor=(0.5, -0.08), frameon=False, fontsize=9,
+    figure.legend(
+        handles=handles, ncols=len(handles), loc="outside lower center", frameon=False, fontsize=9,
         handletextpad=0.5, columnspacing=1.2,
     )  # fmt: skip
 

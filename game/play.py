@@ -119,7 +119,7 @@ def play(config: Play, console: Console) -> Summary:
             raise ServerFailed(f"no answer from {' or '.join(filter(None, doors.values()))}: {error}") from error
         episodes = [episode for leg in legs for episode in leg.episodes]
         costs = CostModel.declared(welcome.features)
-        title = f"{welcome.bundle} on {squad[0].env.terrain.name}"
+        title = f"Bundle {welcome.bundle} on map {squad[0].env.terrain.name}"
         draw_picture(config.picture, squad[0].env.terrain, episodes, costs, welcome.budget_us, title)
     socket = legs[1] if len(legs) > 1 else None
     full_features = full_features_return(config.bundle)

@@ -119,7 +119,7 @@ def summarise(
 
 def print_summary(summary: Summary, console: Console) -> None:
     """The same figures for people."""
-    table = Table(title=f"{summary.episodes} episodes of {summary.map} played by {summary.bundle}", show_header=False)
+    table = Table(title=f"bundle {summary.bundle}, {summary.episodes} episodes on map {summary.map}", show_header=False)
     table.add_column(style="bold")
     table.add_column()
     table.add_row("mean return", _return(summary))
