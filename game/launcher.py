@@ -43,8 +43,9 @@ class ServerProcess:
     sends it SIGTERM when this process dies in any way, kill -9 included; elsewhere kill -9 leaves it running.
     """
 
-    def __init__(self, bundle: Path) -> None:
-        self._bundle = bundle
+    def __init__(self, bundle: Path, *arguments: str) -> None:
+        """`arguments` go to the server's command line as they are."""
+        self._bundle, self._arguments = bundle, arguments
 
     def __enter__(self) -> Self:
         self._folder = tempfile.TemporaryDirectory(prefix="bots-")
@@ -52,7 +53,7 @@ class ServerProcess:
         self._log = Path(self._folder.name) / "server.log"
         command = [
             *_command(), "--bundle", str(self._bundle), "--port", "0",
-            "--uds", str(self._ready_file.with_name("s")), "--ready-file", str(self._ready_file),
+            "--uds", str(self._ready_file.with_name("s")), "--ready-file", str(self._ready_file), *self._arguments,
         ]  # fmt: skip
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
@@ -76,12 +77,20 @@ class ServerProcess:
         self._folder.cleanup()
 
     @property
+    def pid(self) -> int:
+        """The server's process."""
+        return self._process.pid
+
+    @property
     def ended(self) -> bool:
         """Whether the process has ended, which it should not have."""
         return self._process.poll() is not None
 
     def addresses(self) -> dict[str, str]:
-        """Where it listens, by door: `http`, `unix`. Waits until it does; raises ServerFailed if it never will."""
+        """Where it listens, by door: `http`, `unix`, and `tcp` if asked for.
+
+        Waits until it does; raises ServerFailed if it never will.
+        """
         deadline = time.monotonic() + _START_S
         while not self._ready_file.exists():
             if self.ended:
@@ -90,7 +99,7 @@ class ServerProcess:
                 raise ServerFailed(f"the server was not ready after {_START_S:g} s:\n{self.tail()}")
             time.sleep(_POLL_S)
         found = json.loads(self._ready_file.read_text(encoding="utf-8"))
-        return {door: found[door] for door in ("http", "unix")}
+        return {door: url for door, url in found.items() if door != "pid" and url is not None}
 
     def tail(self) -> str:
         """The last lines that the server printed."""

@@ -1,0 +1,183 @@
+"""How long does a turn take? In process, over a Unix socket, TCP and HTTP, for 1 to 256 bots.
+
+A turn is one RequestQueries and one SubmitFeatures for all N bots: two round trips where there is a wire. *Model* is
+the time in the two ONNX graphs (the replies' `infer_us`); what is left is allocation, bookkeeping, codec and transport.
+Rounds visit every transport in turn, so that the ratios hold when the machine's speed drifts. The server is its own
+process; with two cores or more it has one to itself.
+
+    python -m benchmarks.latency --json
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from bot_runtime.bots import Bots
+from bot_runtime.bundle import Bundle
+from bot_runtime.golden import Golden, read_golden
+from game.launcher import ServerProcess
+from protocol.client import BotClient
+
+__all__ = ["Latency", "main", "measure"]
+
+_DOORS = {"uds": "unix", "tcp": "tcp", "http": "http"}
+_WARM_UP = 20
+_ROUND = 50  # turns of one transport before the next has its turn
+_QUANTILES = {"p50_us": 50.0, "p99_us": 99.0, "p999_us": 99.9}
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Time turns over every transport."""
+
+    bundle: Path = Path("bundles/hard")
+    bots: tuple[int, ...] = (1, 16, 64, 256)
+    turns: int = 1000  # of each transport and each number of bots
+    pin: bool = True  # give the server a core of its own, where there are two
+    json: bool = False  # print one JSON line instead of a table
+
+
+Timed = tuple[float, float]  # µs of a whole turn, and of the model in it
+
+
+class _Player:
+    """Plays recorded frames, the same ones over every transport."""
+
+    def __init__(self, bundle: Bundle, golden: Golden, n_bots: int) -> None:
+        self._table = bundle.manifest.features
+        self._free_TF, self._costly_TD = golden["free"], golden["costly"]
+        self._n_bots, self._frame = n_bots, 0
+
+    def turn(self, ask: Callable[..., tuple[NDArray[np.bool_], float]], act: Callable[..., float]) -> Timed:
+        """One turn of all bots; bot n is n frames ahead in the recording, so that a batch is not N equal rows."""
+        rows = (self._frame + np.arange(self._n_bots)) % len(self._free_TF)
+        free_NF, costly_ND = self._free_TF[rows], self._costly_TD[rows]
+        begun = time.perf_counter_ns()
+        query_NM, asked_us = ask(self._frame, free_NF)
+        known_ND = np.where(query_NM[:, self._table.owner], costly_ND, np.float32(0.0))
+        acted_us = act(self._frame, query_NM, known_ND)
+        whole_us = (time.perf_counter_ns() - begun) / 1e3
+        self._frame += 1
+        return whole_us, asked_us + acted_us
+
+
+def _in_process(bundle: Bundle, golden: Golden, n_bots: int) -> Callable[[], Timed]:
+    bots, player = Bots(bundle, max_bots=n_bots), _Player(bundle, golden, n_bots)
+    handles = bots.start(n_bots)
+
+    def ask(frame: int, free_NF: NDArray[np.float32]) -> tuple[NDArray[np.bool_], float]:
+        queries = bots.request_queries(handles, frame, free_NF)
+        return queries.query_NM, queries.infer_us
+
+    def act(frame: int, query_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]) -> float:
+        return bots.submit_features(handles, frame, query_NM, costly_ND).infer_us
+
+    return lambda: player.turn(ask, act)
+
+
+def _over(client: BotClient, bundle: Bundle, golden: Golden, n_bots: int) -> Callable[[], Timed]:
+    client.hello()
+    handles, player = client.start(n_bots), _Player(bundle, golden, n_bots)
+
+    def ask(frame: int, free_NF: NDArray[np.float32]) -> tuple[NDArray[np.bool_], float]:
+        queries = client.query(handles, frame, free_NF)
+        return queries.queries, queries.infer_us
+
+    def act(frame: int, query_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]) -> float:
+        return client.act(handles, frame, query_NM, costly_ND).infer_us
+
+    return lambda: player.turn(ask, act)
+
+
+def measure(config: Latency, console: Console) -> dict[str, dict[int, NDArray[np.float64]]]:
+    """Whole turn and model time in µs, [turns, 2], by transport and number of bots."""
+    bundle = Bundle.load(config.bundle)
+    golden = read_golden((config.bundle / "golden.npz").read_bytes(), bundle.manifest)
+    times: dict[str, dict[int, NDArray[np.float64]]] = {name: {} for name in ("inproc", *_DOORS)}
+    with ExitStack() as stack:
+        most = str(max(config.bots) * len(_DOORS))
+        server = stack.enter_context(ServerProcess(config.bundle, "--tcp-port", "0", "--max-bots", most))
+        addresses = server.addresses()
+        if config.pin:
+            stack.callback(_pin(server.pid))
+        progress = stack.enter_context(Progress(console=console))
+        task = progress.add_task("turns", total=len(config.bots) * config.turns * len(times))
+        for n_bots in config.bots:
+            with ExitStack() as clients:
+                play = {"inproc": _in_process(bundle, golden, n_bots)}
+                for name, door in _DOORS.items():
+                    play[name] = _over(clients.enter_context(BotClient(addresses[door])), bundle, golden, n_bots)
+                for name, rows in _rounds(play, config.turns, lambda done: progress.advance(task, done)).items():
+                    times[name][n_bots] = np.array(rows)
+    return times
+
+
+def _rounds(play: dict[str, Callable[[], Timed]], turns: int, advance: Callable[[int], None]) -> dict[str, list[Timed]]:
+    rows: dict[str, list[Timed]] = {name: [] for name in play}
+    for turn in play.values():
+        for _ in range(_WARM_UP):
+            turn()
+    while any(len(done) < turns for done in rows.values()):
+        for name, turn in play.items():
+            for _ in range(min(_ROUND, turns - len(rows[name]))):
+                rows[name].append(turn())
+                advance(1)
+    return rows
+
+
+def _pin(server_pid: int) -> Callable[[], None]:
+    """The server on one core, this process on another; returns what undoes the latter."""
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) < 2:
+        return lambda: None
+    os.sched_setaffinity(server_pid, {cores[1]})
+    os.sched_setaffinity(0, {cores[0]})
+    return lambda: os.sched_setaffinity(0, cores)
+
+
+def _table(times: dict[str, dict[int, NDArray[np.float64]]]) -> Table:
+    table = Table(title="a turn, µs")
+    for name in ("transport", "bots", "p50", "p99", "p99.9", "model p50", "rest p50", "p50 / in process"):
+        table.add_column(name, justify="left" if name == "transport" else "right")
+    for name, by_bots in times.items():
+        for n_bots, rows in by_bots.items():
+            quantiles = [f"{np.percentile(rows[:, 0], q):,.0f}" for q in _QUANTILES.values()]
+            model, rest = np.median(rows[:, 1]), np.median(rows[:, 0] - rows[:, 1])
+            ratio = np.median(rows[:, 0]) / np.median(times["inproc"][n_bots][:, 0])
+            table.add_row(name, str(n_bots), *quantiles, f"{model:,.0f}", f"{rest:,.0f}", f"{ratio:.2f}")
+    return table
+
+
+def main() -> None:
+    """Command line."""
+    config = tyro.cli(Latency, description=__doc__)
+    times = measure(config, Console(file=sys.stderr))
+    if not config.json:
+        Console().print(_table(times))
+        return
+    line = {
+        name: {
+            str(n_bots): {key: round(float(np.percentile(rows[:, 0], q)), 1) for key, q in _QUANTILES.items()}
+            for n_bots, rows in by_bots.items()
+        }
+        for name, by_bots in times.items()
+    }
+    print(json.dumps(line))
+
+
+if __name__ == "__main__":
+    main()
