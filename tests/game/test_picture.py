@@ -45,4 +45,4 @@ def test_it_can_be_drawn(name, turns, asked, budget_us, tmp_path):
     draw_picture(tmp_path / "p.png", terrain, episodes, CostModel.declared(TABLE), budget_us, "made-up")
     pixels = imread(tmp_path / "p.png")
     assert pixels.shape[:2] == (792, 1650)
-    assert len(np.unique(pixels.reshape(-1, pixels.shape[2]), axis=0)) > 50
+    assert len(np.unique(pixels[:, :, 0])) > 50
