@@ -15,15 +15,17 @@ import msgspec
 
 from protocol.errors import BadJson, BadMsgpack, BadSchema, ProtocolError, TooDeep
 from protocol.features import FeatureTable
-from protocol.messages import Reply, Request
+from protocol.messages import MAX_BOTS_PER_MESSAGE, Reply, Request
 
 __all__ = ["MAX_DETAIL_CHARS", "Format", "body_limit", "decode", "decode_request", "encode"]
 
 MAX_DETAIL_CHARS = 300
-_NUMBER_BYTES = 26  # the longest double in JSON with its comma; 9 in msgpack
 _HANDLE_BYTES = 21  # a 63-bit integer in JSON with its comma
 _BIT_BYTES = 2  # `0,`
 _FIXED_BYTES = 16384  # names, brackets, the longest token with every character escaped
+# A list of one number costs 100 bytes of memory and 4 of JSON. msgspec bounds lists before it makes them in msgpack, in
+# JSON only afterwards; no message has more lists than this.
+_MAX_JSON_LISTS = 4 * MAX_BOTS_PER_MESSAGE + 4096
 
 Message = TypeVar("Message", bound=msgspec.Struct)
 
@@ -35,15 +37,19 @@ class Format(Enum):
     JSON = "application/json"
 
 
-def body_limit(table: FeatureTable, max_bots: int) -> int:
-    """Bytes of the largest message that can make sense: `max_bots` bots of this table, written as JSON at its widest.
+_NUMBER_BYTES = {Format.MSGPACK: 9, Format.JSON: 26}  # a double at its widest, with its comma in JSON
 
-    A bot needs at most 26 bytes a number, for F + 1 numbers in a request or D numbers and 2 M bits in a submission.
+
+def body_limit(table: FeatureTable, max_bots: int, form: Format) -> int:
+    """Bytes of the largest message that can make sense: `max_bots` bots of this table, in lists of the widest numbers.
+
+    A bot has at most F + 1 numbers in a request, D numbers and 2 M bits in a submission, and 3 numbers in a start.
     """
-    per_request = _NUMBER_BYTES * (table.n_free + 1)
-    per_submission = _NUMBER_BYTES * table.n_costly + 2 * _BIT_BYTES * table.n_queries
-    per_bot = _HANDLE_BYTES + 16 + max(per_request, per_submission, 3 * _NUMBER_BYTES)
-    return _FIXED_BYTES + _NUMBER_BYTES * table.n_queries + per_bot * max_bots
+    number_bytes = _NUMBER_BYTES[form]
+    per_request = number_bytes * (table.n_free + 1)
+    per_submission = number_bytes * table.n_costly + 2 * _BIT_BYTES * table.n_queries
+    per_bot = _HANDLE_BYTES + 16 + max(per_request, per_submission, 3 * number_bytes)
+    return _FIXED_BYTES + number_bytes * table.n_queries + per_bot * max_bots
 
 
 def decode(body: bytes, form: Format, message: type[Message]) -> Message:
@@ -70,6 +76,8 @@ def _decoder(form: Format, message: Any) -> msgspec.msgpack.Decoder[Any] | msgsp
 
 
 def _decode(body: bytes, form: Format, message: Any) -> Any:
+    if form is Format.JSON and body.count(b"[") > _MAX_JSON_LISTS:
+        raise _refusal(body, form, msgspec.ValidationError("more lists than any message has"))
     try:
         return _decoder(form, message).decode(body)
     except RecursionError:

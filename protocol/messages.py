@@ -39,9 +39,9 @@ PROTOCOL_VERSION = 1
 MAX_BOTS_PER_MESSAGE = 65536
 MAX_FRAME = 2**53  # the largest count that a JSON number or a double holds exactly
 
-Blob = bytes | list[list[float]]
+Blob = bytes | Annotated[list[list[float]], Meta(max_length=MAX_BOTS_PER_MESSAGE)]
 """float32 [N, n]: little-endian row-major bytes in msgpack, nested lists in JSON."""
-Bits = bytes | list[list[Annotated[int, Meta(ge=0, le=1)]]]
+Bits = bytes | Annotated[list[list[Annotated[int, Meta(ge=0, le=1)]]], Meta(max_length=MAX_BOTS_PER_MESSAGE)]
 """bool [N, M]: ceil(M / 8) bytes a row, feature i is bit i % 8 of byte i // 8; rows of 0/1 in JSON."""
 
 _Frame = Annotated[int, Meta(ge=0, le=MAX_FRAME)]

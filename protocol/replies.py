@@ -20,7 +20,7 @@ from protocol.transport import ReplyError
 
 __all__ = ["Actions", "Queries", "Welcome", "read_actions", "read_queries", "read_reply", "read_welcome"]
 
-_MAX_ARRAY = 65536  # msgpack reserves memory for the length that an array claims
+_MAX_ARRAY = 65536  # msgpack reserves memory for the length that an array claims, at every depth
 _REPLY_TO = {
     "hello": "welcome",
     "start_bots": "bots_started",
@@ -66,7 +66,7 @@ class Actions(NamedTuple):
 def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
     """The reply's fields; raises the ProtocolError that an `error` message names, ReplyError if this is no answer."""
     with _reading(request_type):
-        reply = dict(msgpack.unpackb(body, max_array_len=_MAX_ARRAY))
+        reply = dict(msgpack.unpackb(body, max_array_len=min(_MAX_ARRAY, len(body))))
         kind = reply["type"]
     if kind == "error":
         raise _refused(reply)

@@ -46,12 +46,12 @@ class Handlers:
         self._table = self._manifest.features
         self._connections = connections
         self._token = token
-        self.max_body_bytes = body_limit(self._table, bots.max_bots)
+        self.max_body_bytes = {form: body_limit(self._table, bots.max_bots, form) for form in Format}
 
     def handle(self, request: Request, connection_id: str | None, form: Format) -> Reply:
         """The reply to one request, its blobs written for `form`. Raises ProtocolError, having done nothing."""
         if isinstance(request, Hello):
-            return self._hello(request, connection_id)
+            return self._hello(request, connection_id, form)
         connection = self._connections.get(connection_id)
         match request:
             case RequestQueries():
@@ -84,7 +84,7 @@ class Handlers:
         if token is None or not hmac.compare_digest(token.encode(), self._token.encode()):
             raise Unauthorized("the token is missing or wrong")
 
-    def _hello(self, hello: Hello, connection_id: str | None) -> Welcome:
+    def _hello(self, hello: Hello, connection_id: str | None, form: Format) -> Welcome:
         self.check_token(hello.token)
         if connection_id is not None:
             raise BadSchema("this socket has said hello already: it carries one connection")
@@ -105,7 +105,7 @@ class Handlers:
             budget_us=self._manifest.budget_us,
             context_length=self._manifest.context_length,
             max_bots=self._bots.max_bots,
-            max_body_bytes=self.max_body_bytes,
+            max_body_bytes=self.max_body_bytes[form],
         )
 
     def _start_bots(self, request: StartBots, connection: Connection) -> BotsStarted:

@@ -88,7 +88,7 @@ class HttpDoor:
         return Response(b'{"status":"ready"}', media_type=Format.JSON.value)
 
     async def _body(self, request: Request, form: Format) -> bytes:
-        limit = self._handlers.max_body_bytes
+        limit = self._handlers.max_body_bytes[form]
         announced = request.headers.get("content-length", "0")
         if not announced.isdecimal() or len(announced) > 18 or int(announced) > limit:
             raise TooLarge(f"the body has {announced[:20]} bytes, the limit is {limit}")

@@ -84,7 +84,7 @@ class StreamDoor:
         while not self._draining:
             silence_s = self._frame_deadline_s if socket.connection is None else self._idle_ttl_s
             try:
-                body = await socket.receive(silence_s, self._handlers.max_body_bytes)
+                body = await socket.receive(silence_s, self._handlers.max_body_bytes[Format.MSGPACK])
             except TooLarge as error:
                 await socket.send(refusal(error, Format.MSGPACK).body)
                 await socket.discard()

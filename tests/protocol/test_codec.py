@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from typing import Any
 
 import msgpack
@@ -150,7 +151,22 @@ def test_the_widest_messages_fit_the_limit(max_bots: int) -> None:
         {"count": max_bots, "seeds": bots, "target_returns": [wide] * max_bots, "budgets_us": [wide] * max_bots},
         {"token": "\x01" * 1024, "cost_model": {"call_us": wide, "feature_us": [wide] * TABLE.n_queries}},
     ]
-    limit = codec.body_limit(TABLE, max_bots)
     for message in messages:
-        assert len(msgspec.json.encode(message)) + 64 <= limit
-        assert len(msgpack.packb(message)) + 64 <= limit
+        assert len(msgspec.json.encode(message)) + 64 <= codec.body_limit(TABLE, max_bots, Format.JSON)
+        assert len(msgpack.packb(message)) + 64 <= codec.body_limit(TABLE, max_bots, Format.MSGPACK)
+
+
+@pytest.mark.parametrize("form", list(Format))
+@pytest.mark.parametrize("row", [[], [1]])
+def test_small_lists_without_number_are_refused_before_they_take_memory(form: Format, row: list[int]) -> None:
+    """A list takes some 100 bytes, its bytes on the wire are one to four."""
+    rows = 400_000
+    message = {"type": "submit_features", "frame": 0, "bots": [1], "acquired": b"", "values": [row] * rows}
+    body = msgpack.packb(message) if form is Format.MSGPACK else msgspec.json.encode(message)
+    tracemalloc.start()
+    try:
+        with pytest.raises(BadSchema):
+            codec.decode_request(body, form)
+        assert tracemalloc.get_traced_memory()[1] < 0.1 * 56 * rows
+    finally:
+        tracemalloc.stop()

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import protocol
-from protocol.codec import body_limit
+from protocol.codec import Format, body_limit
 from protocol.errors import ERRORS_BY_CODE
 from protocol.messages import Reply, Request
 from protocol.transport import ROUTES
@@ -34,5 +34,8 @@ def test_every_route_is_named_with_its_request() -> None:
 
 def test_the_limit_is_the_formula() -> None:
     f, m, d = TABLE.n_free, TABLE.n_queries, TABLE.n_costly
-    assert "16,384 + 26·M + max_bots · (37 + max(26·(F + 1), 26·D + 4·M, 78))" in TEXT
-    assert body_limit(TABLE, 9) == 16384 + 26 * m + 9 * (37 + max(26 * (f + 1), 26 * d + 4 * m, 78))
+    assert (
+        "16,384 + b·M + max_bots · (37 + max(b·(F + 1), b·D + 4·M, 3·b)) with b = 9 in msgpack and 26 in JSON" in TEXT
+    )
+    for form, b in ((Format.MSGPACK, 9), (Format.JSON, 26)):
+        assert body_limit(TABLE, 8, form) == 16384 + b * m + 8 * (37 + max(b * (f + 1), b * d + 4 * m, 3 * b))

@@ -6,6 +6,7 @@ import json
 import struct
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -157,6 +158,19 @@ def test_a_body_over_the_limit_is_413_before_it_is_decoded_or_even_read(served: 
     chunks = (bytes(4096) for _ in range(limit // 4096 + 1))  # without a length: Transfer-Encoding: chunked
     answer = http_request(served.addresses["http"], "POST", path, chunks, MSGPACK)
     assert (answer.status, msgpack.unpackb(answer.body)["code"]) == (413, "TOO_LARGE")
+
+
+@pytest.mark.parametrize("media_type", ["application/json", "application/msgpack"])
+def test_each_format_has_its_own_limit_and_welcome_names_it(served: Served, media_type: str) -> None:
+    def answered(body: bytes) -> tuple[int, dict[str, Any]]:
+        answer = http_request(served.addresses["http"], "POST", PATHS[0], body, {"Content-Type": media_type})
+        return answer.status, (json.loads if media_type.endswith("json") else msgpack.unpackb)(answer.body)
+
+    _, welcome = answered(b"{}" if media_type.endswith("json") else b"\x80")
+    limit = welcome["max_body_bytes"]
+    assert answered(b"\xc1" * limit)[0] == 400
+    status, refused = answered(b"\xc1" * (limit + 1))
+    assert (status, refused["code"]) == (413, "TOO_LARGE")
 
 
 @pytest.mark.parametrize(
