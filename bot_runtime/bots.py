@@ -85,8 +85,8 @@ class Bots:
     ) -> _Handles:
         """Start bots and return their handles, int64 [count].
 
-        Defaults: the n-th bot started here has seed n; the bundle's target return and budget (none at all when that
-        is the full cost); the costs that the feature table declares. Raises BadSchema, BadShape, NonFinite,
+        Defaults: the n-th bot started here has seed n; the bundle's target return and budget (none at all when it
+        was trained without a limit); the costs that the feature table declares. Raises BadSchema, BadShape, NonFinite,
         OutOfRange, TooManyBots.
         """
         if count < 1:
@@ -94,7 +94,7 @@ class Bots:
         manifest, limit = self.bundle.manifest, inputs.MAX_RETURN
         model = cost_model or CostModel.declared(manifest.features)
         inputs.check_costs(model, manifest.features)
-        default_us = np.inf if manifest.budget == 1.0 else manifest.budget_us
+        default_us = np.inf if manifest.is_unlimited else manifest.budget_us
         targets_N, budgets_N = np.full(count, manifest.target_return), np.full(count, default_us)
         if target_returns is not None:
             targets_N = inputs.per_bot("target_returns", target_returns, count, -limit, limit)

@@ -86,6 +86,11 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.context_length - 1
 
     @property
+    def is_unlimited(self) -> bool:
+        """Whether the bundle was trained without a limit; then a bot has none unless it is given one."""
+        return self.budget == 1.0
+
+    @property
     def budget_us(self) -> float:
         """The default budget of one bot in µs, at the costs that the feature table declares."""
         return self.budget * float(self.features.costs_us.sum())

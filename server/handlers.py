@@ -11,9 +11,10 @@ import hmac
 import numpy as np
 
 from bot_runtime.bots import Bots
+from bot_runtime.inputs import check_costs
 from protocol import arrays
 from protocol.codec import Format, body_limit
-from protocol.errors import BadSchema, BadShape, Unauthorized
+from protocol.errors import BadSchema, Unauthorized
 from protocol.features import CostModel
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -91,18 +92,16 @@ class Handlers:
         if hello.protocol != PROTOCOL_VERSION:
             raise BadSchema(f"protocol {hello.protocol} is not spoken here, expected {PROTOCOL_VERSION}")
         cost_model = hello.cost_model or CostModel.declared(self._table)
-        if len(cost_model.feature_us) != self._table.n_queries:
-            raise BadShape(
-                f"cost_model.feature_us has {len(cost_model.feature_us)} numbers, expected {self._table.n_queries}"
-            )
+        check_costs(cost_model, self._table)
         self.end_silent()
+        budget_us = cost_model.full_us if self._manifest.is_unlimited else self._manifest.budget_us
         return Welcome(
             connection=self._connections.open(cost_model).id,
             bundle=self._manifest.name,
             features=self._table,
             action=self._manifest.action,
             cost_model=cost_model,
-            budget_us=self._manifest.budget_us,
+            budget_us=budget_us,
             context_length=self._manifest.context_length,
             max_bots=self._bots.max_bots,
             max_body_bytes=self.max_body_bytes[form],

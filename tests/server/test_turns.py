@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
+import msgspec
 import numpy as np
 import pytest
 
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
+from bot_runtime.manifest import Manifest
 from protocol.client import BotClient, Welcome
+from protocol.codec import Format
 from protocol.errors import (
     BadSchema,
     BadShape,
@@ -28,7 +32,11 @@ from protocol.errors import (
     UnrequestedFeature,
 )
 from protocol.features import CostModel
+from protocol.messages import Hello
 from protocol.transport import open_transport
+from server.connections import Connections
+from server.handlers import Handlers
+from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE
 from tests.server.serving import Served, costly_numbers, free_numbers, http_request, play, same
 
@@ -57,6 +65,15 @@ def test_hello_says_what_is_served_and_the_engines_cost_model_counts(client: Bot
     assert (welcome.bundle, welcome.context_length) == ("tiny", 4)
     assert welcome.cost_model == CostModel.declared(TABLE)
     assert welcome.budget_us == pytest.approx(0.6 * welcome.cost_model.full_us)
+
+
+def test_without_a_limit_the_budget_is_what_everything_costs_on_this_connection(tmp_path: Path) -> None:
+    manifest = msgspec.json.decode((make_bundle(tmp_path, budget=1.0) / "manifest.json").read_bytes(), type=Manifest)
+    bots = SimpleNamespace(bundle=SimpleNamespace(manifest=manifest), max_bots=1)
+    handlers = Handlers(bots, Connections(2, 1.0), None)
+    model = CostModel(1000.0, (3.0,) * manifest.features.n_queries)
+    for hello, full_us in ((Hello(cost_model=model), model.full_us), (Hello(), manifest.budget_us)):
+        assert handlers.handle(hello, None, Format.MSGPACK).budget_us == full_us
 
 
 def test_predicted_costs_follow_the_cost_model_and_stay_within_budgets(served: Served) -> None:
