@@ -33,12 +33,11 @@ from protocol.errors import (
 )
 from server.answer import Answer, answer, refusal
 from server.handlers import Handlers
-from server.openapi import ROUTES, document, summary
+from server.openapi import CONNECTION_HEADER, ROUTES, document, summary
 from server.worker import Worker
 
-__all__ = ["CONNECTION_HEADER", "HttpDoor", "create_app"]
+__all__ = ["HttpDoor", "create_app"]
 
-CONNECTION_HEADER = "X-Bot-Connection"
 _FORMATS = {form.value: form for form in Format}
 _BY_STATUS: dict[int, type[ProtocolError]] = {404: NoRoute, 405: MethodNotAllowed}
 
@@ -84,7 +83,7 @@ class HttpDoor:
     async def readyz(self, request: Request) -> Response:
         """A new connection would be served."""
         if not self.ready:
-            return _refused(NotReady("the server is draining"), Format.JSON)
+            return _refused(NotReady("the server is draining", retry_after_s=1.0), Format.JSON)
         return Response(b'{"status":"ready"}', media_type=Format.JSON.value)
 
     async def _body(self, request: Request, form: Format) -> bytes:

@@ -15,8 +15,9 @@ from protocol import messages
 from protocol.codec import Format
 from protocol.errors import ERRORS_BY_CODE
 
-__all__ = ["ROUTES", "document", "summary"]
+__all__ = ["CONNECTION_HEADER", "ROUTES", "document", "summary"]
 
+CONNECTION_HEADER = "X-Bot-Connection"
 ROUTES: dict[str, tuple[type[messages.Request], type[messages.Reply]]] = {
     "/v1/connections": (messages.Hello, messages.Welcome),
     "/v1/bots/start": (messages.StartBots, messages.BotsStarted),
@@ -26,7 +27,7 @@ ROUTES: dict[str, tuple[type[messages.Request], type[messages.Reply]]] = {
     "/v1/connections/close": (messages.Goodbye, messages.Farewell),
 }
 _CONNECTION = {
-    "name": "X-Bot-Connection",
+    "name": CONNECTION_HEADER,
     "in": "header",
     "required": True,
     "description": "The `connection` of Welcome.",

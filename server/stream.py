@@ -51,12 +51,12 @@ class StreamDoor:
         socket = _Socket(reader, writer, self._frame_deadline_s)
         task = asyncio.current_task()
         try:
-            if task is None or self._draining or len(self._open) >= self._max_sockets:
+            if len(self._open) >= self._max_sockets:
                 full = TooManyConnections(f"all {self._max_sockets} sockets are taken", retry_after_s=1.0)
                 await socket.send(refusal(full, Format.MSGPACK).body)
-                return
-            self._open[socket] = task
-            await self._converse(socket)
+            elif task is not None:
+                self._open[socket] = task
+                await self._converse(socket)
         except (OSError, asyncio.IncompleteReadError):
             pass  # the client went away or was too slow: there is nobody to tell
         finally:

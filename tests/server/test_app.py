@@ -7,15 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
 from protocol.errors import BadBundle
+from server import app
 from server.app import _listen, running
 from server.connections import Connections
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
 from server.settings import Settings
+from server.stream import StreamDoor
 from server.worker import Worker
 
 
@@ -30,9 +33,9 @@ def test_a_draining_door_is_alive_and_not_ready(bundle: Path) -> None:
     worker = Worker(1)
     bots = Bots(Bundle.load(bundle), max_bots=1)
     door = HttpDoor(Handlers(bots, Connections(1, 1.0), None), worker, bots.bundle.manifest, body_deadline_s=1.0)
-    app = create_app(door)
+    application = create_app(door)
 
-    def get(path: str) -> tuple[int, dict[str, Any]]:
+    def get(path: str) -> tuple[int, dict[str, Any], dict[bytes, bytes]]:
         sent: list[dict[str, Any]] = []
 
         async def receive() -> dict[str, Any]:
@@ -42,17 +45,39 @@ def test_a_draining_door_is_alive_and_not_ready(bundle: Path) -> None:
             sent.append(message)
 
         scope = {"type": "http", "method": "GET", "path": path, "headers": [], "query_string": b"", "root_path": ""}
-        asyncio.run(app(scope, receive, send))
-        return sent[0]["status"], json.loads(sent[1]["body"])
+        asyncio.run(application(scope, receive, send))
+        return sent[0]["status"], json.loads(sent[1]["body"]), dict(sent[0]["headers"])
 
     try:
-        assert get("/readyz") == (200, {"status": "ready"})
+        assert get("/readyz")[:2] == (200, {"status": "ready"})
         door.ready = False
-        status, refused = get("/readyz")
-        assert (status, refused["code"]) == (503, "NOT_READY")
-        assert get("/healthz") == (200, {"status": "ok"})
+        status, refused, headers = get("/readyz")
+        assert (status, refused["code"], headers[b"retry-after"]) == (503, "NOT_READY", b"1")
+        assert get("/healthz")[:2] == (200, {"status": "ok"})
     finally:
         worker.close()
+
+
+def test_a_server_that_ends_is_not_ready_before_it_drains(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    doors: list[HttpDoor] = []
+    ready_when_draining: list[bool] = []
+
+    def remember(door: HttpDoor) -> FastAPI:
+        doors.append(door)
+        return create_app(door)
+
+    async def drain(*_: object) -> None:
+        ready_when_draining.append(doors[0].ready)
+
+    monkeypatch.setattr(app, "create_app", remember)
+    monkeypatch.setattr(StreamDoor, "drain", drain)
+
+    async def main() -> None:
+        async with running(Settings(bundle=bundle, port=0)):
+            assert doors[0].ready
+
+    asyncio.run(main())
+    assert ready_when_draining == [False]
 
 
 def test_a_server_that_cannot_start_leaves_nothing_behind(bundle: Path, tmp_path: Path) -> None:

@@ -222,3 +222,11 @@ def test_too_many_bots_say_when_to_try_again_and_start_none(client: BotClient) -
     assert len(client.query(bots, 0, free_numbers(TABLE, room, 0)).queries) == room
     assert client.stop(bots) == room
     assert np.unique(np.concatenate([bots, client.start(room)])).size == 2 * room
+
+
+def test_refusals_for_lack_of_room_carry_retry_after_over_http(served: Served) -> None:
+    with BotClient(served.addresses["http"]) as client:
+        headers = {**MSGPACK, "X-Bot-Connection": client.hello().connection}
+        body = msgpack.packb({"count": 65536})
+        answer = http_request(served.addresses["http"], "POST", "/v1/bots/start", body, headers)
+        assert (answer.status, answer.headers["retry-after"]) == (429, "1")
