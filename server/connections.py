@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from protocol.errors import BadSchema, NoBot, NoConnection, TooManyConnections
+from protocol.errors import NoBot, NoConnection, TooManyConnections
 from protocol.features import CostModel
 
 __all__ = ["Connection", "Connections"]
@@ -26,13 +26,10 @@ class Connection:
     bots: set[int] = field(default_factory=set)
 
     def check_owns(self, handles: Sequence[int]) -> None:
-        """Raise NoBot for a bot that is not this connection's, BadSchema for a bot named twice."""
-        named = set(handles)
-        if not named <= self.bots:
+        """Raise NoBot for a bot that is not this connection's."""
+        if not self.bots.issuperset(handles):
             unknown = next(handle for handle in handles if handle not in self.bots)
             raise NoBot(f"no bot {unknown} on this connection")
-        if len(named) != len(handles):
-            raise BadSchema("a message names each of its bots once")
 
 
 class Connections:

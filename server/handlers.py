@@ -142,5 +142,6 @@ class Handlers:
         return BotsStopped(count=self._stop(connection, request.bots))
 
     def _stop(self, connection: Connection, handles: list[int]) -> int:
+        stopped = self._bots.stop(np.array(handles, dtype=np.int64)) if handles else 0
         connection.bots.difference_update(handles)
-        return self._bots.stop(np.array(handles, dtype=np.int64)) if handles else 0
+        return stopped

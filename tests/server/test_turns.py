@@ -5,19 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgpack
-import msgspec
 import numpy as np
 import pytest
 
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
-from bot_runtime.manifest import Manifest
 from protocol.client import BotClient, Welcome
-from protocol.codec import Format
 from protocol.errors import (
     BadSchema,
     BadShape,
@@ -32,11 +28,7 @@ from protocol.errors import (
     UnrequestedFeature,
 )
 from protocol.features import CostModel
-from protocol.messages import Hello
 from protocol.transport import open_transport
-from server.connections import Connections
-from server.handlers import Handlers
-from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE
 from tests.server.serving import Served, costly_numbers, free_numbers, http_request, play, same
 
@@ -65,28 +57,6 @@ def test_hello_says_what_is_served_and_the_engines_cost_model_counts(client: Bot
     assert (welcome.bundle, welcome.context_length) == ("tiny", 4)
     assert welcome.cost_model == CostModel.declared(TABLE)
     assert welcome.budget_us == pytest.approx(0.6 * welcome.cost_model.full_us)
-
-
-def test_without_a_limit_the_budget_is_what_everything_costs_on_this_connection(tmp_path: Path) -> None:
-    manifest = msgspec.json.decode((make_bundle(tmp_path, budget=1.0) / "manifest.json").read_bytes(), type=Manifest)
-    bots = SimpleNamespace(bundle=SimpleNamespace(manifest=manifest), max_bots=1)
-    handlers = Handlers(bots, Connections(2, 1.0), None)
-    model = CostModel(1000.0, (3.0,) * manifest.features.n_queries)
-    for hello, full_us in ((Hello(cost_model=model), model.full_us), (Hello(), manifest.budget_us)):
-        assert handlers.handle(hello, None, Format.MSGPACK).budget_us == full_us
-
-
-def test_predicted_costs_follow_the_cost_model_and_stay_within_budgets(served: Served) -> None:
-    model = CostModel(call_us=3.0, feature_us=tuple(2.0 + i for i in range(TABLE.n_queries)))
-    with BotClient(served.addresses["tcp"]) as client:
-        assert client.hello(cost_model=model).cost_model == model
-        bots = client.start(N, seeds=SEEDS, budgets_us=[0.0, 12.0, 1e6])
-        for frame in range(20):
-            queries = client.query(bots, frame, free_numbers(TABLE, N, frame), frame_budget_us=40.0)
-            assert queries.cost_us == pytest.approx(model.query_cost_us(queries.queries))
-            assert queries.cost_us[0] == 0.0
-            assert queries.cost_us[1] <= 12.0
-            assert queries.cost_us.sum() <= 40.0
 
 
 class Raw:
@@ -180,6 +150,7 @@ def test_refused_requests_change_nothing(client: BotClient, welcome: Welcome) ->
         _refused(BadShape, client.query, bots, frame, free, [0.0])
         _refused(BadSchema, client.query, bots, -1, free)
         _refused(BadSchema, client.query, [bots[0], bots[0], bots[1]], frame, free)
+        _refused(BadSchema, client.stop, [bots[1], bots[1]])
         _refused(NoBot, client.query, [*bots[:2], bots[2] + 2**32], frame, free)
         queries = client.query(bots, frame, free, np.full(N, 0.25))
         asked = queries.queries
@@ -216,6 +187,16 @@ def test_failed_features_count_as_not_acquired_and_values_not_acquired_do_not_co
     assert np.array_equal(first(False, 0.0), first(False, 49.0))
     assert np.array_equal(first(True, 0.0), first(True, 49.0))
     assert not np.array_equal(first(True, 0.0), first(False, 0.0))
+
+
+def test_stopping_a_bot_of_a_pending_query_leaves_the_others_to_their_next_frame(client: BotClient) -> None:
+    bots = client.start(N, seeds=SEEDS)
+    queries = client.query(bots, 0, free_numbers(TABLE, N, 0)).queries
+    client.stop(bots[:1])
+    _refused(NoBot, client.act, bots, 0, queries, costly_numbers(TABLE, N, 0))
+    _refused(NoPendingQuery, client.act, bots[1:], 0, queries[1:], costly_numbers(TABLE, N, 0)[1:])
+    _refused(FrameReused, client.query, bots[1:], 0, free_numbers(TABLE, N, 0)[1:])
+    assert not play(client, TABLE, bots[1:], range(1, 2))[0].reasons.any()
 
 
 def test_skipped_frames_and_abandoned_queries_are_legal(client: BotClient) -> None:
