@@ -11,6 +11,8 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,12 +25,14 @@ from bot_runtime.manifest import FILES, FileEntry, Manifest
 from bot_runtime.policy import Cache, Policy
 from protocol.errors import BadBundle
 
-__all__ = ["MANIFEST_FILE", "MAX_FILE_BYTES", "MAX_MANIFEST_BYTES", "Bundle"]
+__all__ = ["MANIFEST_FILE", "MAX_FILE_BYTES", "MAX_MANIFEST_BYTES", "MAX_TURN_MS", "Bundle"]
 
 MANIFEST_FILE = "manifest.json"
 MAX_MANIFEST_BYTES = 2**20
 MAX_FILE_BYTES = 256 * 2**20
+MAX_TURN_MS = 100.0  # a frame is 16: what takes longer than this, at its fastest, can serve nobody
 _PROBE_BOTS = 3
+_PROBE_TURNS = 5  # a busy machine may stretch some of them
 
 
 @dataclass(frozen=True)
@@ -45,20 +49,20 @@ class Bundle:
         return self.manifest.name
 
     @classmethod
-    def load(cls, path: Path, *, replay: bool = True) -> Bundle:
+    def load(cls, path: Path, *, replay: bool = True, clock: Callable[[], int] = time.perf_counter_ns) -> Bundle:
         """Read and verify the bundle in directory `path`. Other files there are ignored.
 
         In this order, each step only on what passed the one before: regular files and not links, sizes, the manifest's
-        schema, sizes and SHA-256 of the three files, operators, the graphs' inputs and outputs, a batch of bots, and
-        (unless `replay` is false) the golden episode. Raises BadBundle naming the file, what was expected and what
-        was found.
+        schema, sizes and SHA-256 of the three files, operators, the graphs' inputs and outputs, a batch of bots, how
+        long their turn takes (`clock` counts ns), and (unless `replay` is false) the golden episode. Raises BadBundle
+        naming the file, what was expected and what was found.
         """
         manifest = _read_manifest(path / MANIFEST_FILE)
         contents = {file: _read_verified(path / file, manifest.files[file]) for file in FILES}
         bundle = cls(manifest, contents["acquisition.onnx"], contents["action.onnx"])
         check_graph("acquisition.onnx", bundle.acquisition)
         check_graph("action.onnx", bundle.action)
-        _verify_behaviour(bundle, contents["golden.npz"], with_replay=replay)
+        _verify_behaviour(bundle, contents["golden.npz"], with_replay=replay, clock=clock)
         return bundle
 
 
@@ -97,17 +101,27 @@ def _read(path: Path, limit: int) -> bytes:
     return content
 
 
-def _verify_behaviour(bundle: Bundle, golden: bytes, *, with_replay: bool) -> None:
+def _verify_behaviour(bundle: Bundle, golden: bytes, *, with_replay: bool, clock: Callable[[], int]) -> None:
     recorded = read_golden(golden, bundle.manifest)
     policy = Policy(bundle)
     try:
-        _probe_batch(policy, bundle.manifest)
+        _probe_latency(policy, bundle.manifest, clock)
         if with_replay:
             replay(policy, bundle.manifest, recorded)
     except BadBundle:
         raise
     except Exception as error:  # onnxruntime raises a dozen unrelated types for a graph that cannot run
         raise BadBundle(f"the graphs of {bundle.name} do not run: {str(error)[:300]}") from error
+
+
+def _probe_latency(policy: Policy, manifest: Manifest, clock: Callable[[], int]) -> None:
+    for _ in range(_PROBE_TURNS):
+        started_ns = clock()
+        _probe_batch(policy, manifest)
+        turn_ms = (clock() - started_ns) / 1e6
+        if turn_ms <= MAX_TURN_MS:
+            return
+    raise BadBundle(f"a turn of {manifest.name} takes {turn_ms:.0f} ms, expected at most {MAX_TURN_MS:g}")
 
 
 def _probe_batch(policy: Policy, manifest: Manifest) -> None:

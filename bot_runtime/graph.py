@@ -13,8 +13,8 @@ from protocol.errors import BadBundle
 
 __all__ = ["ALLOWED_OPS", "check_graph"]
 
-# Dense arithmetic only: nothing loops, branches, draws numbers, reads strings or touches anything but its inputs, so
-# that a graph's running time is bounded by its own size.
+# Dense arithmetic only: nothing loops, branches, draws numbers, reads strings or touches anything but its inputs. How
+# long that takes (Expand and Tile make much of little) is for the loader to measure.
 _OPS = """
     Abs Add And ArgMax ArgMin Cast CastLike Ceil Clip Concat Constant ConstantOfShape Cos Div DequantizeLinear
     DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand Flatten Floor Gather GatherElements GatherND Gelu Gemm Greater

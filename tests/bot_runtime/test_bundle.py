@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import os
 import shutil
 import zipfile
@@ -164,6 +165,15 @@ def test_mutated_and_rehashed_is_loaded_or_refused(copy: Path, bundle_path: Path
     rehash(copy)
     with contextlib.suppress(BadBundle):
         Bundle.load(copy)
+
+
+def test_a_turn_that_is_never_fast_enough_is_refused(copy: Path) -> None:
+    limit_ns = int(bundle_module.MAX_TURN_MS * 1e6)
+    slow = itertools.count(0, limit_ns + 1)
+    with pytest.raises(BadBundle, match="a turn of tiny takes 100 ms"):
+        Bundle.load(copy, clock=slow.__next__)
+    stalled_once = iter([0, 10 * limit_ns, 20 * limit_ns, 21 * limit_ns])
+    Bundle.load(copy, clock=stalled_once.__next__)
 
 
 @pytest.mark.parametrize("name", ["probs", "actions", "hidden"])
