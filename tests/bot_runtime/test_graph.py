@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import onnx
+import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
 from bot_runtime.bundle import Bundle
+from bot_runtime.policy import Policy
 from protocol.errors import BadBundle
 from tests.bundles import rehash
 
@@ -71,6 +73,16 @@ def divide_by_zero(model: onnx.ModelProto) -> None:
     model.graph.node.insert(len(model.graph.node) - 1, zero)
     model.graph.node[-1].input[0] = "infinite"
     model.graph.node.insert(len(model.graph.node) - 1, helper.make_node("Div", ["zero", "zero"], ["infinite"]))
+
+
+def test_only_onnx_is_loaded_never_another_format_that_nobody_checked(bundle: Bundle, tmp_path: Path) -> None:
+    """onnxruntime guesses the format from bytes 4 to 8, which a protobuf message may hold too."""
+    options = onnxruntime.SessionOptions()
+    options.optimized_model_filepath = str(tmp_path / "model.ort")
+    options.add_session_config_entry("session.save_model_format", "ORT")
+    onnxruntime.InferenceSession(bundle.acquisition, options)
+    with pytest.raises(BadBundle, match="does not load"):
+        Policy(Bundle(bundle.manifest, (tmp_path / "model.ort").read_bytes(), bundle.action))
 
 
 @pytest.mark.parametrize("file", ["acquisition.onnx", "action.onnx"])
