@@ -1,7 +1,7 @@
-"""What runs in a frame. This room knows nothing about bytes, sockets or torch."""
+"""What runs inside a frame: bundles, policies, contexts, budgets and the Bots façade. Never imports torch."""
 
 import os
 
-# onnxruntime 1.31 reports usage over the network unless told not to before it is first imported. A game server must not
-# talk to anyone that its operator did not name; who wants it sets the variable to 0.
+# onnxruntime's wheels report usage to their maker unless told not to before the first import (its Privacy.md). A game
+# server talks to nobody that its operator did not name; who wants the reports sets the variable to 0.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
