@@ -91,7 +91,7 @@ def _limits(budgets_R: _Floats, terms: int) -> _Floats:
 def _fit(items: _Items, limits_R: _Floats) -> _Bools:
     """`asked` where all of it fits, else the greedy choice."""
     asked_RI = items.asked_RI
-    totals_R = np.cumsum(_marginal(items, asked_RI, None), axis=1)[:, -1:].sum(axis=1)
+    totals_R = _marginal(items, asked_RI, None).sum(axis=1)
     tight = np.flatnonzero(~(totals_R <= limits_R) & asked_RI.any(axis=1))
     if tight.size == 0:
         return asked_RI
@@ -122,7 +122,8 @@ def _greedy(items: _Items, limits_R: _Floats) -> _Bools:
     density_RI = np.where(items.costs_RI > 0.0, items.value_RI / items.costs_RI, np.inf)
     order_RI = np.argsort(np.where(items.asked_RI, -density_RI, np.inf), axis=1, kind="stable")
     order_RI = order_RI[:, : items.asked_RI.sum(axis=1).max()]  # what was not asked for sorts last
-    ranked = items.arranged(lambda array_RI: np.take_along_axis(array_RI, order_RI, axis=1))
+    order_RI += np.arange(len(order_RI))[:, None] * items.asked_RI.shape[1]  # as places of the flattened arrays
+    ranked = items.arranged(lambda array_RI: array_RI.take(order_RI))
     costs, owner = ranked.costs_RI, ranked.owner_RI
     limits_R1 = limits_R[:, None]
     left_RI, taken_RI = ranked.asked_RI.copy(), np.zeros_like(ranked.asked_RI)
@@ -140,7 +141,7 @@ def _greedy(items: _Items, limits_R: _Floats) -> _Bools:
         taken_RI |= now_RI
         left_RI &= ~now_RI
     chosen_RI = np.zeros_like(items.asked_RI)
-    np.put_along_axis(chosen_RI, order_RI, taken_RI, axis=1)
+    chosen_RI.put(order_RI, taken_RI)
     return chosen_RI
 
 
@@ -153,5 +154,5 @@ def _marginal(items: _Items, picked_RI: _Bools, opened: _Bools | None) -> _Float
         if opened is not None:
             picked, owners = picked[~opened[owners]], owners[~opened[owners]]
         payers, first = np.unique(owners, return_index=True)
-        marginal_RI.ravel()[picked[first]] += items.calls[payers]
+        marginal_RI.flat[picked[first]] += items.calls[payers]  # ravel() would copy Fortran order
     return marginal_RI

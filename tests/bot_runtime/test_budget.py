@@ -77,8 +77,9 @@ def test_never_above_any_budget(case: tuple) -> None:
 @given(cases())
 def test_deterministic_and_rows_are_independent(case: tuple) -> None:
     probs, sampled, costs, call, budgets, frame = case
+    columns_first = map(np.asfortranarray, (probs, sampled, np.broadcast_to(costs, probs.shape)))
     assert np.array_equal(
-        allocate(probs, sampled, costs, call, budgets, frame), allocate(probs, sampled, costs, call, budgets, frame)
+        allocate(probs, sampled, costs, call, budgets, frame), allocate(*columns_first, call, budgets, frame)
     )
     together = allocate(probs, sampled, costs, call, budgets)
     for row in range(len(probs)):
