@@ -28,6 +28,7 @@ from protocol.features import CostModel
 __all__ = ["Bots"]
 
 _MAX_BUDGET_US = 1e9
+_NO_NUMBERS = np.zeros(0)
 _Handles = NDArray[np.int64]
 
 
@@ -130,8 +131,9 @@ class Bots:
         limit = inputs.MAX_RETURN
         rewards_N = np.zeros(handles.size) if rewards_N is None else rewards_N
         rewards_N = inputs.per_bot("rewards", rewards_N, handles.size, -limit, limit)
-        shared = () if frame_budget_us is None else (frame_budget_us,)
-        shared_us = inputs.per_bot("frame_budget_us", shared, len(shared), 0.0, _MAX_BUDGET_US)
+        shared_us = _NO_NUMBERS
+        if frame_budget_us is not None:
+            shared_us = inputs.per_bot("frame_budget_us", (frame_budget_us,), 1, 0.0, _MAX_BUDGET_US)
         request = (free_NF.copy(), rewards_N, shared_us)
         if retried is not None:
             _check_same(request, retried.request, frame)
@@ -221,7 +223,7 @@ class Bots:
         infer_us = (self._clock() - started_ns) / 1e3
         usable_N = step.finite_N
         # A Gaussian head may overshoot; what leaves is within the action that the bundle declares.
-        learned_NA = np.clip(step.action_NA, self._low_A, self._high_A)
+        learned_NA = np.minimum(np.maximum(step.action_NA, self._low_A), self._high_A)
         action_NA, reasons_N = fallback_actions(
             learned_NA,
             usable_N,

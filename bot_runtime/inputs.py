@@ -43,14 +43,15 @@ def per_bot(
     numbers_N = np.array(numbers, dtype=np.float64)
     if numbers_N.shape != (n_bots,):
         raise BadShape(f"{name} has shape {list(numbers_N.shape)}, expected [{n_bots}], one number a bot")
-    if not np.isfinite(numbers_N).all():
-        row = int(np.argmin(np.isfinite(numbers_N)))
+    legal_N = (numbers_N >= low) & (numbers_N <= high)  # false for NaN
+    if legal_N.all():
+        return numbers_N
+    finite_N = np.isfinite(numbers_N)
+    if not finite_N.all():
+        row = int(np.argmin(finite_N))
         raise NonFinite(f"{name} of bot {row} of the message is {numbers_N[row]}, expected a finite number")
-    legal_N = (numbers_N >= low) & (numbers_N <= high)
-    if not legal_N.all():
-        row = int(np.argmin(legal_N))
-        raise OutOfRange(f"{name} of bot {row} of the message is {numbers_N[row]}, expected {low:g} to {high:g}")
-    return numbers_N
+    row = int(np.argmin(legal_N))
+    raise OutOfRange(f"{name} of bot {row} of the message is {numbers_N[row]}, expected {low:g} to {high:g}")
 
 
 def seeds(numbers: Sequence[int] | NDArray[np.integer], n_bots: int) -> NDArray[np.uint64]:
@@ -85,21 +86,27 @@ def check_features(
     bits, numbers = (handles_N.size, table.n_queries), (handles_N.size, table.n_costly)
     _check_shape("acquired", acquired_NM, bits, np.dtype(np.bool_))
     _check_shape("values", costly_ND, numbers, np.dtype(np.float32))
-    if failed_NM is None:
-        failed_NM = np.zeros(bits, dtype=np.bool_)
-    _check_shape("failed", failed_NM, bits, np.dtype(np.bool_))
-    unrequested_NM = (acquired_NM | failed_NM) & ~query_NM
-    if unrequested_NM.any():
-        bot, feature = _first(unrequested_NM, handles_N, table.costly)
-        raise UnrequestedFeature(f"{feature} of bot {bot} came or failed, but was not asked for")
-    missing_NM = query_NM & ~acquired_NM & ~failed_NM
-    if missing_NM.any():
-        bot, feature = _first(missing_NM, handles_N, table.costly)
-        raise MissingFeature(f"{feature} of bot {bot} was asked for, and neither came nor is marked failed")
-    acquired_NM = acquired_NM & ~failed_NM
-    known_ND = acquired_NM[:, table.owner]
+    answered_NM, known_NM = acquired_NM, query_NM
+    if failed_NM is not None:
+        _check_shape("failed", failed_NM, bits, np.dtype(np.bool_))
+        answered_NM, known_NM = acquired_NM | failed_NM, query_NM & ~failed_NM
+    _check_answered(answered_NM, query_NM, handles_N, table.costly)
+    known_ND = known_NM[:, table.owner]
     _check_values(costly_ND, known_ND, handles_N, table.costly, table.costly_range)
-    return acquired_NM, np.where(known_ND, costly_ND, np.float32(0.0))
+    return known_NM, np.where(known_ND, costly_ND, np.float32(0.0))
+
+
+def _check_answered(
+    answered_NM: _Bools, query_NM: _Bools, handles_N: NDArray[np.int64], costly: tuple[Feature, ...]
+) -> None:
+    wrong_NM = answered_NM != query_NM
+    if not wrong_NM.any():
+        return
+    row, column = (int(index) for index in np.argwhere(wrong_NM)[0])
+    where = f"{costly[column].name} of bot {handles_N[row]}"
+    if answered_NM[row, column]:
+        raise UnrequestedFeature(f"{where} came or failed, but was not asked for")
+    raise MissingFeature(f"{where} was asked for, and neither came nor is marked failed")
 
 
 def _check_shape(name: str, array: NDArray[np.generic], shape: tuple[int, int], dtype: np.dtype[np.generic]) -> None:
@@ -129,8 +136,3 @@ def _check_values(
     if not finite.all():
         raise NonFinite(f"{feature.name} {where}, expected a finite number")
     raise OutOfRange(f"{feature.name} {where}, expected {feature.low:g} to {feature.high:g}")
-
-
-def _first(bits_NM: _Bools, handles_N: NDArray[np.int64], costly: tuple[Feature, ...]) -> tuple[int, str]:
-    row, column = (int(index) for index in np.argwhere(bits_NM)[0])
-    return int(handles_N[row]), costly[column].name

@@ -71,8 +71,7 @@ class Slots:
         known_N &= self._live_B[slots_N] & (self._generations_B[slots_N] == generations_N)
         if not known_N.all():
             raise NoBot(f"bot {int(handles_N[int(np.argmin(known_N))])} is unknown or was stopped")
-        counts_B = np.bincount(slots_N, minlength=self.capacity)
-        if counts_B.max() > 1:
-            twice = int(handles_N[int(np.argmax(counts_B[slots_N] > 1))])
+        if len(set(slots_N.tolist())) < slots_N.size:
+            twice = int(handles_N[int(np.argmax(np.bincount(slots_N)[slots_N] > 1))])
             raise BadSchema(f"bot {twice} is named more than once, expected at most once a message")
         return slots_N

@@ -122,8 +122,8 @@ class Turns:
         ids_N = self._turn_of_B[slots_N]
         self._turn_of_B[slots_N] = _NONE
         for key in _distinct_ids(ids_N):
-            count = int((ids_N == key).sum())
             if key != _NONE:
+                count = int(np.count_nonzero(ids_N == key))
                 left.append((self._turns[key], count))
                 self._members[key] -= count
                 if self._members[key] == 0:
