@@ -21,6 +21,7 @@ class TrainConfig:
     environment: str = ""  # gymnasium id that evaluation plays, such as game.env:game/Navigation-hard-v0
     seed: int = 0
     episodes: int | None = None  # read only the first so many episodes (None: all)
+    held_out: float = 0.04  # share of the episodes, the last ones, that only measure the loss
 
     acquisition: Literal["learned", "all", "none"] = "learned"  # learn the queries, or force all or none
     budget: float = 0.1  # C: most that a query may cost, as a share of the full cost (Eq. 1)
@@ -46,16 +47,16 @@ class TrainConfig:
     updates: int = 4000
     learning_rate: float = 2e-3
     warmup: int = 100  # updates of linear warm-up, then a cosine to zero
-    weight_decay: float = 1e-2
+    weight_decay: float = 0.1
     gradient_clip: float = 1.0
 
     log_every: int = 50  # updates between lines of metrics
     checkpoint_every: int = 500  # updates between checkpoints
 
     def __post_init__(self) -> None:
-        for name in ("budget", "frame_budget"):
+        for name in ("budget", "frame_budget", "held_out"):
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected a share of the full cost in [0, 1]")
+                raise ValueError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
         if self.width % self.n_heads:
             raise ValueError(f"width {self.width} is not a multiple of n_heads {self.n_heads}")
         if self.context_length < 2:

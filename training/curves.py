@@ -26,6 +26,9 @@ def plot_curves(metrics: Path, out: Path, config: TrainConfig) -> None:
     figure.suptitle(f"{config.name}: {config.dataset.name}, C = {config.budget:g}, ε = {config.penalty_step:g}")
     for axes, (key, label) in zip(figure.subplots(2, 2).flat, _PANELS, strict=True):
         axes.plot([line["update"] for line in lines], [line[key] for line in lines])
+        if key == "delta" and all("held_out" in line for line in lines):
+            axes.plot([line["update"] for line in lines], [line["held_out"] for line in lines], label="held out")
+            axes.legend()
         if key == "cost":
             axes.axhline(config.budget, linestyle="--", color="tab:red", label="budget C")
             axes.legend()

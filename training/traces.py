@@ -8,7 +8,7 @@ layout that stand in the dataset's own metadata. Shape letters: E episodes, S st
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -31,7 +31,7 @@ class TracesError(ValueError):
 
 @dataclass(frozen=True)
 class Traces:
-    """All episodes of a dataset, one after another."""
+    """Episodes of a dataset, one after another."""
 
     features: FeatureTable
     action: ActionSpec
@@ -46,6 +46,14 @@ class Traces:
     def episode_returns_E(self) -> NDArray[np.float32]:
         """Return of each episode, shape [E]."""
         return self.returns_to_go_S.numpy()[self.starts_E]
+
+    def split(self, share: float) -> tuple[Traces, Traces]:
+        """All but the last `share` of the episodes, and those: what is trained on, and what is held out."""
+        first = len(self.lengths_E) - round(share * len(self.lengths_E))
+        kept, rest = slice(0, first), slice(first, None)
+        return tuple(
+            replace(self, starts_E=self.starts_E[part], lengths_E=self.lengths_E[part]) for part in (kept, rest)
+        )
 
 
 @dataclass(frozen=True)

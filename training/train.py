@@ -28,7 +28,7 @@ from training.checkpoint import Facts, load_checkpoint, save_checkpoint
 from training.config import TrainConfig
 from training.models import BudgetedDecisionTransformer, ModelConfig
 from training.objectives import action_loss, nearest_bins, penalty, penalty_weight, query_cost
-from training.traces import Traces, draw_windows, load_traces, moments
+from training.traces import Batch, Traces, draw_windows, load_traces, moments
 
 __all__ = ["TrainState", "build_model", "main", "train", "update"]
 
@@ -81,20 +81,28 @@ def learning_rate(config: TrainConfig, done: int) -> float:
     return config.learning_rate * warm * 0.5 * (1.0 + math.cos(math.pi * done / config.updates))
 
 
+def draw(
+    config: TrainConfig, model: BudgetedDecisionTransformer, traces: Traces, chance: np.random.Generator
+) -> tuple[Batch, torch.Tensor, float]:
+    """A batch, the queries that the network samples along it, [B, T, M], and how many passes or steps those took."""
+    batch = draw_windows(traces, config.batch, config.window, chance)
+    shape = (*batch.valid_BT.shape, model.config.n_queries)
+    uniforms_BTM = torch.from_numpy(chance.random(shape, dtype=np.float32))
+    with torch.no_grad():
+        context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
+    sample = sample_queries if config.sampler == "parallel" else sample_queries_incrementally
+    return batch, *sample(model, context, batch.costly_BTD, uniforms_BTM)
+
+
 def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: torch.Tensor) -> None:
     """One iteration of Algorithm 1's loop. Its chance depends on the seed and its number alone, so that a resumed run
     is the run that was stopped."""
-    model, chance = state.model, np.random.default_rng([config.seed, state.done])
-    batch = draw_windows(traces, config.batch, config.window, chance)
-    context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
-    uniforms_BTM = torch.from_numpy(chance.random((*batch.valid_BT.shape, len(costs_M)), dtype=np.float32))
-    sample = sample_queries if config.sampler == "parallel" else sample_queries_incrementally
-    query_BTM, passes = sample(model, context, batch.costly_BTD, uniforms_BTM)
-    bins_BTA = nearest_bins(batch.actions_BTA, model.config.low, model.config.high, model.config.bins)
+    model = state.model
+    batch, query_BTM, passes = draw(config, model, traces, np.random.default_rng([config.seed, state.done]))
     parts: dict[str, float] = {}
 
     def loss(sampled: Rollout) -> torch.Tensor:
-        delta = action_loss(model.action_logits(sampled.hidden_BTW), bins_BTA, batch.valid_BT)
+        delta = _delta(model, sampled, batch)
         cost_BT = query_cost(sampled.query_BTM, costs_M)
         phi = penalty(cost_BT, config.budget, batch.valid_BT)
         parts.update(delta=delta.item(), phi=phi.item())
@@ -103,6 +111,7 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: torc
         return delta + state.penalty_weight * phi
 
     state.optimiser.zero_grad(set_to_none=True)
+    context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
     backward(rollout(model, context, batch.costly_BTD, query_BTM.requires_grad_()), loss, config.sweeps)
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
     for group in state.optimiser.param_groups:
@@ -112,6 +121,19 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: torc
         state.penalty_weight = penalty_weight(state.penalty_weight, parts["phi"], config.penalty_step)
     state.done += 1
     state.metrics = {**parts, "gamma": state.penalty_weight, "passes": float(passes), "gradient_norm": float(norm)}
+
+
+@torch.no_grad()
+def held_out_loss(config: TrainConfig, model: BudgetedDecisionTransformer, traces: Traces) -> float:
+    """Δ on episodes that are not trained on; the same windows and the same noise every time."""
+    batch, query_BTM, _ = draw(config, model, traces, np.random.default_rng(config.seed))
+    context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
+    return _delta(model, rollout(model, context, batch.costly_BTD, query_BTM), batch).item()
+
+
+def _delta(model: BudgetedDecisionTransformer, sampled: Rollout, batch: Batch) -> torch.Tensor:
+    bins_BTA = nearest_bins(batch.actions_BTA, model.config.low, model.config.high, model.config.bins)
+    return action_loss(model.action_logits(sampled.hidden_BTW), bins_BTA, batch.valid_BT)
 
 
 def train(config: TrainConfig) -> TrainState:
@@ -129,9 +151,10 @@ def train(config: TrainConfig) -> TrainState:
     config.write(config.out / "config.json")
     _write_versions(config.out / "versions.json", traces)
     costs_M = torch.tensor(traces.features.costs_us, dtype=torch.float32)
-    with _Run(config, state, checkpoint, facts) as run:
+    training, held_out = traces.split(config.held_out)
+    with _Run(config, state, checkpoint, facts, held_out) as run:
         while state.done < config.updates:
-            update(config, state, traces, costs_M)
+            update(config, state, training, costs_M)
             run.record()
     return state
 
@@ -139,8 +162,11 @@ def train(config: TrainConfig) -> TrainState:
 class _Run:
     """The outside of a run: progress, metrics and checkpoints. An interrupted run goes on from its last checkpoint."""
 
-    def __init__(self, config: TrainConfig, state: TrainState, checkpoint: Path, facts: Facts) -> None:
-        self._config, self._state, self._checkpoint, self._facts = config, state, checkpoint, facts
+    def __init__(
+        self, config: TrainConfig, state: TrainState, checkpoint: Path, facts: Facts, held_out: Traces
+    ) -> None:
+        self._config, self._state, self._held_out = config, state, held_out
+        self._checkpoint, self._facts = checkpoint, facts
         self._sums: dict[str, float] = {}
         self._began = time.monotonic() - state.seconds
         metrics = config.out / "metrics.jsonl"
@@ -170,7 +196,10 @@ class _Run:
             self._sums[key] = self._sums.get(key, 0.0) + value
         self._progress.update(self._task, completed=state.done)
         if state.done % config.log_every == 0:
-            self._log({key: value / config.log_every for key, value in self._sums.items()})
+            means = {key: value / config.log_every for key, value in self._sums.items()}
+            if len(self._held_out.lengths_E):
+                means["held_out"] = held_out_loss(config, state.model, self._held_out)
+            self._log(means)
             self._sums.clear()
         if state.done % config.checkpoint_every == 0 or state.done == config.updates:
             save_checkpoint(self._checkpoint, config, self._facts, state)
@@ -181,7 +210,7 @@ class _Run:
         self._lines.flush()
         for key, value in means.items():
             self._board.add_scalar(key, value, self._state.done)
-        now = " ".join(f"{key} {means[key]:.3g}" for key in ("delta", "cost", "gamma", "passes"))
+        now = " ".join(f"{key} {means[key]:.3g}" for key in ("delta", "held_out", "cost", "gamma") if key in means)
         self._progress.update(self._task, now=now)
 
 

@@ -48,6 +48,15 @@ def test_windows_stay_inside_their_episode_and_mark_padding(dataset: Path) -> No
     assert {0.0, 1.0} <= starts, "windows must begin at an episode's start as well as inside it"
 
 
+def test_held_out_episodes_are_never_drawn(dataset: Path) -> None:
+    kept, rest = load_traces(dataset).split(0.25)
+    assert (len(kept.lengths_E), len(rest.lengths_E)) == (30, 10)
+    generator, boundary = np.random.default_rng(0), int(rest.starts_E[0])
+    seen = torch.cat([draw_windows(kept, 64, 12, generator).costly_BTD.flatten(0, 1) for _ in range(20)])
+    drawn = {tuple(row) for row in seen.tolist()}
+    assert drawn <= {tuple(row) for row in kept.costly_SD[:boundary].float().tolist()}
+
+
 def test_moments_are_the_mean_and_a_floored_deviation() -> None:
     x = torch.zeros(1000, 2)
     x[:, 0] = torch.linspace(-1, 1, 1000)

@@ -73,6 +73,7 @@ def test_writes_what_is_needed_to_repeat_the_run(trained: tuple[Path, TrainState
     lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert [line["update"] for line in lines] == list(range(10, 251, 10))
     assert lines[-1]["delta"] < lines[0]["delta"]
+    assert lines[-1]["held_out"] < lines[0]["held_out"]
     assert json.loads((out / "versions.json").read_text())["torch"].startswith("2.13.0")
     assert state.done == 250
 
