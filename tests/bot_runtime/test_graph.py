@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 
 from bot_runtime.bundle import Bundle
 from bot_runtime.policy import Policy
@@ -85,6 +86,14 @@ def test_only_onnx_is_loaded_never_another_format_that_nobody_checked(bundle: Bu
         Policy(Bundle(bundle.manifest, (tmp_path / "model.ort").read_bytes(), bundle.action))
 
 
+def answer_the_first_bot_only(model: onnx.ModelProto) -> None:
+    last = model.graph.node[-1]
+    name, last.output[0] = last.output[0], "all"
+    for bound, number in (("from", 0), ("to", 1), ("axis", 0)):
+        model.graph.initializer.append(numpy_helper.from_array(np.array([number]), bound))
+    model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], [name]))
+
+
 @pytest.mark.parametrize("file", ["acquisition.onnx", "action.onnx"])
 @pytest.mark.parametrize(
     ("change", "match"),
@@ -99,6 +108,7 @@ def test_only_onnx_is_loaded_never_another_format_that_nobody_checked(bundle: Bu
         (keep_a_constant_outside, "another file"),
         (use_a_function, "local functions"),
         (divide_by_zero, "differ by nan"),
+        (answer_the_first_bot_only, r"of 3 bots has shape \[1"),
         (lambda model: model.ClearField("graph"), "holds 0 graphs"),
         (lambda model: model.graph.ClearField("node"), "does not load"),
     ],

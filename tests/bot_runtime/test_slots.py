@@ -30,6 +30,10 @@ def test_handles_of_an_earlier_process_are_unknown(bundle: Bundle) -> None:
         Engine(after).ask(before.start(2), 0)
 
 
+def test_processes_differ_in_their_first_generation(bundle: Bundle) -> None:
+    assert Bots(bundle, max_bots=1).start(1) != Bots(bundle, max_bots=1).start(1)
+
+
 def test_generations_wrap_within_63_bits(bundle: Bundle) -> None:
     bots = Bots(bundle, max_bots=1, first_generation=2**31 - 1)
     first = bots.start(1)
@@ -59,6 +63,7 @@ def test_a_freed_slot_is_zeroed(engine: Engine) -> None:
             assert np.array_equal(array, getattr(engine.bots._contexts, name)), name
     assert not engine.bots._budgets_B.any()
     assert not engine.bots._costs_BM.any()
+    engine.turn(engine.bots.start(8), 0)  # an earlier frame than the slots' last bots saw
 
 
 def test_a_stopped_bot_ends_a_pending_query_for_all_its_bots(engine: Engine) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -174,6 +175,17 @@ def test_codes_and_fields_of_a_newer_server() -> None:
     newer = {**VECTORS["welcome"].message, "colour": 1}
     newer["features"] = {"features": [{**each, "unit": "m"} for each in newer["features"]["features"]], "more": 1}
     assert read_welcome(newer).features == TABLE
+
+
+def test_an_array_bomb_takes_no_more_memory_than_its_bytes_could_fill() -> None:
+    bomb = b"\xdd\x00\x01\x00\x00" * 800  # arrays in arrays that claim 65,536 entries each
+    tracemalloc.start()
+    try:
+        with pytest.raises(ReplyError):
+            read_reply(bomb, "hello")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
 
 
 @given(st.binary(max_size=100) | st.sampled_from([v.body for v in REPLIES]), st.data())

@@ -158,10 +158,11 @@ def test_the_widest_messages_fit_the_limit(max_bots: int) -> None:
 
 @pytest.mark.parametrize("form", list(Format))
 @pytest.mark.parametrize("row", [[], [1]])
-def test_small_lists_without_number_are_refused_before_they_take_memory(form: Format, row: list[int]) -> None:
+@pytest.mark.parametrize("field", ["acquired", "values"])
+def test_rows_without_number_are_refused_before_they_take_memory(form: Format, row: list[int], field: str) -> None:
     """A list takes some 100 bytes, its bytes on the wire are one to four."""
     rows = 400_000
-    message = {"type": "submit_features", "frame": 0, "bots": [1], "acquired": b"", "values": [row] * rows}
+    message = {"type": "submit_features", "frame": 0, "bots": [1], "acquired": b"", "values": b"", field: [row] * rows}
     body = msgpack.packb(message) if form is Format.MSGPACK else msgspec.json.encode(message)
     tracemalloc.start()
     try:

@@ -29,6 +29,23 @@ def test_listening_sockets_say_that_they_are_tcp(host: str) -> None:
         assert listening.proto == socket.IPPROTO_TCP
 
 
+def test_http_and_tcp_listen_on_such_sockets(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ports: list[int] = []
+
+    def listen(host: str, port: int) -> socket.socket:
+        listening = _listen(host, port)
+        ports.append(listening.getsockname()[1])
+        return listening
+
+    monkeypatch.setattr(app, "_listen", listen)
+
+    async def main() -> list[int]:
+        async with running(Settings(bundle=bundle, port=0, tcp_port=0)) as addresses:
+            return [int(addresses[door].rpartition(":")[2]) for door in ("http", "tcp")]
+
+    assert asyncio.run(main()) == ports
+
+
 def test_a_draining_door_is_alive_and_not_ready(bundle: Path) -> None:
     worker = Worker(1)
     bots = Bots(Bundle.load(bundle), max_bots=1)

@@ -12,7 +12,7 @@ import pytest
 from bot_runtime.manifest import Manifest
 from protocol.client import BotClient
 from protocol.codec import Format
-from protocol.errors import FrameReused
+from protocol.errors import BadShape, FrameReused
 from protocol.features import CostModel
 from protocol.messages import Hello
 from server.connections import Connections
@@ -52,6 +52,11 @@ def test_costs_and_budgets_are_by_the_connections_own_cost_model(served: Served,
         assert 10.0 < most_us[0, 1] <= 20.0
         assert most_us[1, 1] == 0.0  # one feature and the call cost the second engine 50
         assert most_us[1, 2] == 10.0 * most_us[0, 2] > 50.0
+
+
+def test_a_cost_model_prices_every_costly_feature(served: Served) -> None:
+    with BotClient(served.addresses["http"]) as client, pytest.raises(BadShape, match=f"expected {TABLE.n_queries}"):
+        client.hello(cost_model=CostModel(0.0, (1.0,)))
 
 
 @pytest.mark.parametrize("door", ["http", "tcp", "unix"])

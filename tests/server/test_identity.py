@@ -114,6 +114,26 @@ def _until_started(raw: RawStream) -> bool:
     return any(raw.frame(message)["type"] == "bots_started" for _ in range(2000))
 
 
+def test_the_bots_of_a_silent_connection_are_freed_without_anyone_saying_hello(bundle: Path, tmp_path: Path) -> None:
+    clock = FakeClock()
+    with serve(bundle, tmp_path / "s", clock, idle_ttl_s=0.2, max_bots=1) as served:
+        http = served.addresses["http"]
+        with BotClient(http) as silent, BotClient(http) as talking:
+            silent.hello()
+            silent.start(1)
+            clock.now += 0.1
+            talking.hello()
+            clock.now += 0.15
+            assert any(_starts(talking) for _ in range(10**4))
+
+
+def _starts(client: BotClient) -> bool:
+    try:
+        return client.start(1).size == 1
+    except TooManyBots:
+        return False
+
+
 def test_tokens(bundle: Path, tmp_path: Path) -> None:
     with serve(bundle, tmp_path / "s", token="s3cret é") as served:
         for door in ("http", "tcp", "unix"):
