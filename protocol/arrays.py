@@ -97,7 +97,7 @@ def _check_rows(rows: Sequence[Sequence[float]], shape: tuple[int, int], name: s
 
 
 def _narrow(array: NDArray[np.float64], name: str) -> NDArray[np.float32]:
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused here
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes infinite, and is refused here
         narrow = array.astype(np.float32)
     if (np.isinf(narrow) & np.isfinite(array)).any():
         raise OutOfRange(f"{name} holds a number too large for float32")

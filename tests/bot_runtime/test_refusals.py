@@ -58,6 +58,15 @@ def refusals(
         (errors.BadSchema, "more than once", lambda: bots.stop(handles[[1, 1]])),
         (errors.NoPendingQuery, "does not fit", lambda: _submit_nothing(engine, handles, frame)),
         (errors.StaleFrame, "does not fit", lambda: _submit_nothing(engine, handles, 0)),
+        (errors.FrameReused, "other content", lambda: _submit_changed(engine, handles, frame - 1)),
+        (errors.NoPendingQuery, "exactly these bots", lambda: _submit_nothing(engine, handles[::-1], frame - 1)),
+        (errors.NoPendingQuery, "exactly these bots", lambda: _submit_nothing(engine, handles[:1], frame - 1)),
+    ]  # fmt: skip
+
+
+def start_refusals(bots: Bots) -> list[tuple[type[Exception], str, Callable[[], object]]]:
+    """Everything that can be refused to bots that are to start."""
+    return [
         (errors.TooManyBots, "slots are taken", lambda: bots.start(100)),
         (errors.BadSchema, "count is 0", lambda: bots.start(0)),
         (errors.BadShape, "seeds has 1", lambda: bots.start(2, seeds=[1])),
@@ -66,9 +75,6 @@ def refusals(
         (errors.OutOfRange, "budgets_us", lambda: bots.start(1, budgets_us=[-0.5])),
         (errors.NonFinite, "budgets_us", lambda: bots.start(1, budgets_us=[math.nan])),
         (errors.BadShape, "cost_model", lambda: bots.start(1, cost_model=CostModel(0.0, (1.0,)))),
-        (errors.FrameReused, "other content", lambda: _submit_changed(engine, handles, frame - 1)),
-        (errors.NoPendingQuery, "exactly these bots", lambda: _submit_nothing(engine, handles[::-1], frame - 1)),
-        (errors.NoPendingQuery, "exactly these bots", lambda: _submit_nothing(engine, handles[:1], frame - 1)),
     ]  # fmt: skip
 
 
@@ -130,7 +136,7 @@ def test_after_any_refusal_the_next_20_turns_are_byte_identical(bundle: Bundle) 
     engine = Engine(Bots(bundle, max_bots=8))
     handles = engine.bots.start(2)
     assert engine.play(handles, range(4)) == expected[:4]
-    for error, match, call in refusals(engine, handles, 4):
+    for error, match, call in [*refusals(engine, handles, 4), *start_refusals(engine.bots)]:
         with pytest.raises(error, match=match):
             call()
     queries = engine.ask(handles, 4)
