@@ -16,7 +16,7 @@ from bot_runtime.policy import Cache, Step
 
 __all__ = ["Contexts"]
 
-Slots = NDArray[np.int64]
+_Ints = NDArray[np.int64]
 
 
 class Contexts:
@@ -42,12 +42,12 @@ class Contexts:
         self._returns_to_go_B = np.zeros(capacity, dtype=np.float64)
         self._last_action_BA = np.zeros((capacity, manifest.action.size), dtype=np.float32)
 
-    def begin(self, slots_N: Slots, seeds_N: NDArray[np.uint64], target_returns_N: NDArray[np.float64]) -> None:
+    def begin(self, slots_N: _Ints, seeds_N: NDArray[np.uint64], target_returns_N: NDArray[np.float64]) -> None:
         """Give zeroed rows to new bots: an empty context, their seeds, and their target returns to go."""
         self._seeds_B[slots_N] = seeds_N
         self._returns_to_go_B[slots_N] = target_returns_N
 
-    def clear(self, slots_N: Slots) -> None:
+    def clear(self, slots_N: _Ints) -> None:
         """Zero every number of these rows, so that nothing of a stopped bot reaches the next one."""
         self._keys[:, slots_N] = 0.0
         self._values[:, slots_N] = 0.0
@@ -55,27 +55,27 @@ class Contexts:
         for array in (self._hidden_BW, self._seeds_B, self._turns_B, self._returns_to_go_B, self._last_action_BA):
             array[slots_N] = 0
 
-    def hidden(self, slots_N: Slots) -> NDArray[np.float32]:
+    def hidden(self, slots_N: _Ints) -> NDArray[np.float32]:
         """The trunk's state after each bot's last turn, zeros before its first, shape [N, W]."""
         return self._hidden_BW[slots_N]
 
-    def seeds(self, slots_N: Slots) -> NDArray[np.uint64]:
+    def seeds(self, slots_N: _Ints) -> NDArray[np.uint64]:
         """The seed of each bot's noise, shape [N]."""
         return self._seeds_B[slots_N]
 
-    def turns(self, slots_N: Slots) -> NDArray[np.int64]:
+    def turns(self, slots_N: _Ints) -> _Ints:
         """How many turns each context took, shape [N]."""
         return self._turns_B[slots_N]
 
-    def returns_to_go(self, slots_N: Slots) -> NDArray[np.float64]:
+    def returns_to_go(self, slots_N: _Ints) -> NDArray[np.float64]:
         """What is left of each bot's target return, shape [N]."""
         return self._returns_to_go_B[slots_N]
 
-    def last_action(self, slots_N: Slots) -> NDArray[np.float32]:
+    def last_action(self, slots_N: _Ints) -> NDArray[np.float32]:
         """The action of each bot's last turn (zeros before its first), shape [N, A]."""
         return self._last_action_BA[slots_N]
 
-    def cache(self, slots_N: Slots) -> Cache:
+    def cache(self, slots_N: _Ints) -> Cache:
         """Keys and values [L, N, H, S, d] of these bots; valid until the next call of this method."""
         layers, capacity, *rest = self._keys.shape
         if slots_N.size == capacity and bool((slots_N[1:] > slots_N[:-1]).all()):  # all rows, in order
@@ -87,15 +87,15 @@ class Contexts:
         np.take(self._values, slots_N, axis=1, out=values, mode="clip")
         return Cache(keys, values)
 
-    def ages(self, slots_N: Slots) -> NDArray[np.int64]:
+    def ages(self, slots_N: _Ints) -> _Ints:
         """The age of each ring slot, 1 to K - 1, or K where it is empty, shape [N, S]."""
         return self._ages_BS[slots_N]
 
-    def spend(self, slots_N: Slots, returns_to_go_N: NDArray[np.float64]) -> None:
+    def spend(self, slots_N: _Ints, returns_to_go_N: NDArray[np.float64]) -> None:
         """Set what is left of each bot's target return."""
         self._returns_to_go_B[slots_N] = returns_to_go_N
 
-    def advance(self, slots_N: Slots, step: Step) -> None:
+    def advance(self, slots_N: _Ints, step: Step) -> None:
         """Append one turn to each context."""
         ring_N = self._turns_B[slots_N] % self._n_slots
         self._keys[:, slots_N, :, ring_N] = step.new_keys.swapaxes(0, 1)  # advanced indices put N first

@@ -19,7 +19,7 @@ from protocol.turn import Event, Phase, is_retry, transition
 __all__ = ["Actions", "Queries", "Turn", "Turns"]
 
 _NONE = 0  # the turn id of a bot that has had no turn
-Slots = NDArray[np.int64]
+_Ints = NDArray[np.int64]
 
 
 class Queries(NamedTuple):
@@ -46,7 +46,7 @@ class Turn:
     """One message's bots in one frame: what came, what was answered, and what the second half needs of the first."""
 
     frame: int
-    handles_N: NDArray[np.int64]
+    handles_N: _Ints
     request: tuple[NDArray[np.generic], ...]  # what a retry must equal
     free_NF: NDArray[np.float32]
     queries: Queries
@@ -72,7 +72,7 @@ class Turns:
         self._next_id = _NONE + 1
         self._counters = counters
 
-    def query(self, handles_N: NDArray[np.int64], slots_N: Slots, frame: int) -> Turn | None:
+    def query(self, handles_N: _Ints, slots_N: _Ints, frame: int) -> Turn | None:
         """The turn that this request repeats, or None when it is a new one; changes nothing.
 
         Raises StaleFrame; FrameReused when any of these bots saw this frame in other company.
@@ -89,7 +89,7 @@ class Turns:
             raise FrameReused(f"frame {frame} was requested before with other bots, or in another order")
         return turn
 
-    def features(self, handles_N: NDArray[np.int64], slots_N: Slots, frame: int) -> Turn:
+    def features(self, handles_N: _Ints, slots_N: _Ints, frame: int) -> Turn:
         """The turn that these features answer (again, if its actions are known); changes nothing.
 
         Raises StaleFrame and NoPendingQuery, the latter also unless the bots are exactly the query's, in its order.
@@ -103,7 +103,7 @@ class Turns:
             raise NoPendingQuery(f"no query of frame {frame} is pending for exactly these bots in this order")
         return turn
 
-    def begin(self, slots_N: Slots, turn: Turn) -> None:
+    def begin(self, slots_N: _Ints, turn: Turn) -> None:
         """Make `turn` the last one of these slots; their pending queries are abandoned."""
         for old, n_bots in self._leave(slots_N):
             self._counters.skipped_frames += n_bots * (turn.frame - old.frame - 1)
@@ -113,11 +113,11 @@ class Turns:
         self._members[self._next_id] = slots_N.size
         self._next_id += 1
 
-    def leave(self, slots_N: Slots) -> None:
+    def leave(self, slots_N: _Ints) -> None:
         """Forget the last turn of these slots."""
         self._leave(slots_N)
 
-    def _leave(self, slots_N: Slots) -> list[tuple[Turn, int]]:
+    def _leave(self, slots_N: _Ints) -> list[tuple[Turn, int]]:
         left: list[tuple[Turn, int]] = []
         ids_N = self._turn_of_B[slots_N]
         self._turn_of_B[slots_N] = _NONE
@@ -130,11 +130,11 @@ class Turns:
                     del self._members[key], self._turns[key]
         return left
 
-    def _distinct(self, slots_N: Slots) -> list[Turn | None]:
+    def _distinct(self, slots_N: _Ints) -> list[Turn | None]:
         return [self._turns.get(key) for key in _distinct_ids(self._turn_of_B[slots_N])]
 
 
-def _distinct_ids(ids_N: NDArray[np.int64]) -> list[int]:
+def _distinct_ids(ids_N: _Ints) -> list[int]:
     same = bool((ids_N == ids_N[0]).all())
     ids: list[int] = (ids_N[:1] if same else np.unique(ids_N)).tolist()
     return ids

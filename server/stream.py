@@ -43,9 +43,6 @@ class StreamDoor:
         self._open: dict[_Socket, asyncio.Task[None]] = {}
         self._draining = False
 
-    def __len__(self) -> int:
-        return len(self._open)
-
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer one socket's requests, one after the other, until it closes."""
         socket = _Socket(reader, writer, self._frame_deadline_s)
