@@ -79,6 +79,15 @@ def test_the_walk_finds_what_it_should(room: str, source: str, wrong: set[str]) 
     assert forbidden(room, imported(source, f"{room}")) == wrong
 
 
+def test_client_and_server_decode_independently() -> None:
+    """Two implementations meet in every test only as long as neither borrows the other's."""
+    client, server = ("client", "replies", "transport", "vectors/__main__"), ("codec", "arrays", "messages")
+    for names, foreign in ((client, {"msgspec", "protocol.codec", "protocol.arrays"}), (server, {"msgpack"})):
+        for name in names:
+            source = (ROOT / "protocol" / f"{name}.py").read_text(encoding="utf-8")
+            assert not imported(source, "protocol") & foreign, name
+
+
 @pytest.mark.parametrize("room", RUN_TIME)
 def test_run_time_rooms_import_without_torch(room: str) -> None:
     """In a process of its own, where importing torch or onnx fails as it does on a machine without them."""
