@@ -36,15 +36,15 @@ class TrainConfig:
     sampled: tuple[str, ...] = ()  # action components sampled from their bins instead of taking the most probable
 
     context_length: int = 20  # K
-    window: int = 40  # timesteps in a training window
+    window: int = 60  # timesteps in a training window
     width: int = 64  # W
     n_layers: int = 2  # L
     n_heads: int = 4  # H
     encoder_width: int = 128  # hidden width of the token encoder and acquisition head
     fourier: int = 4  # octaves of each free number
 
-    batch: int = 64  # windows in an update
-    updates: int = 4000
+    batch: int = 40  # windows in an update
+    updates: int = 3000
     learning_rate: float = 2e-3
     warmup: int = 100  # updates of linear warm-up, then a cosine to zero
     weight_decay: float = 0.1
