@@ -1,0 +1,52 @@
+"""The bundles in this repository: they verify, they are made for this game, and they still play."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bot_runtime.bundle import Bundle
+from game.env import ACTION_SPEC, feature_table
+from training.config import TrainConfig
+from training.evaluate import EvaluateConfig, evaluate
+
+BUNDLES = Path(__file__).parent.parent / "bundles"
+
+
+@pytest.mark.parametrize("name", ["easy", "hard"])
+def test_verifies_and_is_made_for_this_game(name: str) -> None:
+    manifest = Bundle.load(BUNDLES / name).manifest
+    assert manifest.name == name
+    assert manifest.features == feature_table()
+    assert manifest.action == ACTION_SPEC
+    assert manifest.provenance["environment"] == f"game.env:Navigation-{name}-v0"
+
+
+@pytest.mark.parametrize("name", ["easy", "hard"])
+def test_was_made_by_the_configuration_that_we_ship(name: str) -> None:
+    shipped = TrainConfig.read(BUNDLES.parent / "training" / "configs" / f"{name}.json")
+    assert TrainConfig.read(BUNDLES / name / "config.json") == shipped
+
+
+@pytest.mark.parametrize("name", ["easy", "hard"])
+def test_recorded_evaluation_meets_the_bar(name: str) -> None:
+    recorded = json.loads((BUNDLES / name / "evaluation.json").read_text())
+    full = json.loads((BUNDLES / name / "full_features.json").read_text())
+    assert recorded["episodes"] == full["episodes"] == len(recorded["returns"]) == 256
+    assert recorded["return_mean"] >= 0.9 * full["return_mean"]
+    assert recorded["hard_cost_pct"] <= 20.0
+    assert recorded["violations"] == 0
+
+
+def test_hard_still_plays() -> None:
+    """Eight of the recorded episodes again; no rays at all would give about 27."""
+    evaluation, episodes = evaluate(EvaluateConfig(BUNDLES / "hard", episodes=8, workers=1))
+    recorded = json.loads((BUNDLES / "hard" / "evaluation.json").read_text())["returns"][:8]
+    assert evaluation.violations == 0
+    assert evaluation.hard_cost_pct <= 20.0
+    # Another processor may round differently and send an episode another way; most must come out as recorded.
+    same = sum(abs(episode.total - was) < 0.01 for episode, was in zip(episodes, recorded, strict=True))
+    assert same >= 5
+    assert evaluation.return_mean > 45.0
