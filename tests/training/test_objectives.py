@@ -25,6 +25,7 @@ def test_penalty_is_equation_2(queries: list[list[int]], budget: float, costs: l
 
 
 def test_padding_changes_neither_loss_nor_penalty() -> None:
+    torch.manual_seed(0)
     logits, bins = torch.randn(2, 5, 4), torch.randint(0, 4, (2, 5, 1))
     valid = torch.tensor([[1, 1, 1, 0, 0], [1, 1, 1, 1, 1.0]])
     cost = torch.rand(2, 5)
@@ -34,6 +35,13 @@ def test_padding_changes_neither_loss_nor_penalty() -> None:
     other_cost[0, 3:] = 1
     assert torch.equal(action_loss([logits], bins, valid), action_loss([other_logits], other_bins, valid))
     assert torch.equal(penalty(cost, 0.3, valid), penalty(other_cost, 0.3, valid))
+    alone = slice(0, 1), slice(0, 3)  # the first row without its padding
+    assert penalty(cost[:1], 0.3, valid[:1]).item() == pytest.approx(penalty(cost[alone], 0.3, valid[alone]).item())
+    padded, unpadded = (
+        action_loss([logits[:1]], bins[:1], valid[:1]),
+        action_loss([logits[alone]], bins[alone], valid[alone]),
+    )
+    assert padded.item() == pytest.approx(unpadded.item())
 
 
 def test_action_loss_sums_components_and_averages_timesteps() -> None:
