@@ -100,7 +100,11 @@ def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
 
 
 def load_trained(path: Path) -> Trained:
-    """Read the network and facts of a run, for export."""
+    """Read the network and facts of a run, for export. Raises FileNotFoundError."""
+    if not path.exists():
+        raise FileNotFoundError(
+            f"{path} does not exist: training writes it every checkpoint_every updates, and at the end"
+        )
     data = torch.load(path, weights_only=True)
     model = BudgetedDecisionTransformer(msgspec.json.decode(data["model_config"], type=ModelConfig))
     model.load_state_dict(data["model"])

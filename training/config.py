@@ -11,14 +11,18 @@ import msgspec
 __all__ = ["TrainConfig"]
 
 
+_COUNTS = ("window", "width", "n_layers", "n_heads", "encoder_width", "batch", "updates", "warmup", "sweeps")
+_COUNTS += ("log_every", "checkpoint_every")
+
+
 @dataclass(frozen=True)
 class TrainConfig:
-    """One run of Algorithm 1. Lengths in timesteps, costs as shares of the full cost."""
+    """One run of Algorithm 1. Lengths in timesteps, costs as shares of the full cost. Raises ValueError."""
 
-    dataset: Path  # Minari dataset folder, such as data/navigation/hard-expert-v0
+    dataset: Path  # Minari dataset folder, such as data/navigation/navigation/hard-expert-v0
     out: Path  # folder of the run: config, checkpoint, metrics and curves
     name: str  # name of the bundle made from this run
-    environment: str = ""  # gymnasium id that evaluation plays, such as game.env:game/Navigation-hard-v0
+    environment: str = ""  # gymnasium id that evaluation plays, such as game.env:Navigation-hard-v0
     seed: int = 0
     episodes: int | None = None  # read only the first so many episodes (None: all)
     held_out: float = 0.04  # share of the episodes, the last ones, that only measure the loss
@@ -27,7 +31,7 @@ class TrainConfig:
     budget: float = 0.1  # C: most that a query may cost, as a share of the full cost (Eq. 1)
     penalty_step: float = 0.001  # ε: what γ rises by after a batch that violated the budget (Alg. 1)
     acquisition_bias: float = 0.0  # initial logit of every query probability
-    sampler: Literal["incremental", "parallel"] = "incremental"  # same queries; parallel passes suit a GPU
+    sampler: Literal["incremental", "parallel"] = "incremental"  # same queries; incremental is faster on a CPU
     sweeps: int = 2  # backward sweeps of the query's adjoint (training/acquisition.py)
     frame_budget: float = 0.2  # hard cap of one bot's query at run time, unless the engine sets another (bursts pass C)
     target_return: float | None = None  # return asked for at run time (None: 90th percentile of the traces)
@@ -57,6 +61,13 @@ class TrainConfig:
         for name in ("budget", "frame_budget", "held_out"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
+        for name in _COUNTS:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 1 or more")
+        if self.held_out == 1.0:
+            raise ValueError("held_out is 1.0, expected a share that leaves episodes to train on")
+        if min(self.bins, default=0) < 2:
+            raise ValueError(f"bins is {self.bins}, expected 2 or more for each action component")
         if self.width % self.n_heads:
             raise ValueError(f"width {self.width} is not a multiple of n_heads {self.n_heads}")
         if self.context_length < 2:
@@ -64,12 +75,14 @@ class TrainConfig:
 
     @classmethod
     def read(cls, path: Path) -> TrainConfig:
-        """Read a configuration written by `write` or by hand; unknown keys are errors."""
-        data = msgspec.json.decode(path.read_bytes())
-        known = {field.name for field in fields(cls)}
-        if unknown := set(data) - known:
-            raise ValueError(f"{path}: unknown settings {sorted(unknown)}")
-        return msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
+        """Read a configuration written by `write` or by hand. Raises ValueError, for unknown settings too."""
+        try:
+            data = msgspec.json.decode(path.read_bytes(), type=dict[str, object])
+            if unknown := set(data) - {field.name for field in fields(cls)}:
+                raise ValueError(f"unknown settings {sorted(unknown)}")
+            return msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
+        except (ValueError, msgspec.DecodeError) as error:
+            raise ValueError(f"{path}: {error}") from error
 
     def write(self, path: Path) -> None:
         """Write every setting as JSON."""

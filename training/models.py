@@ -4,7 +4,7 @@ This module knows nothing about losses, sampling or files. Shape letters: B batc
 width, K context length, L layers, S = K - 1 cached slots; F free numbers, M costly features, D costly numbers,
 A action components.
 
-Token layout (one token a timestep; departs from the paper's three a timestep, see docs/adr/0002): the normalised
+Token layout (one token a timestep; departs from the paper's three a timestep, see docs/adr/0001): the normalised
 acquired values `q∘o`, the query `q`, the free features and the return-to-go R. The previous action is left out
 (copycat: it lowers the loss and the return).
 """
@@ -198,7 +198,7 @@ class BudgetedDecisionTransformer(nn.Module):
         return self.acquisition_head(torch.cat([previous_hidden, context], dim=-1))
 
     def query_probs(self, previous_hidden: Tensor, context: Tensor) -> Tensor:
-        """q̃_t, the Bernoulli means of the query (Eq. 4), [..., M]; ones or zeros where acquisition is not learned."""
+        """q̃_t, the Bernoulli means of the query, [..., M]; ones or zeros where acquisition is not learned."""
         logits = self.query_logits(previous_hidden, context)
         if self.config.acquisition == "learned":
             return torch.sigmoid(logits)

@@ -73,33 +73,24 @@ def returns_to_go(rewards_T: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def load_traces(path: Path, *, episodes: int | None = None) -> Traces:
-    """Read a Minari dataset whose observations are {"free": [T+1, F], "costly": [T+1, D]}.
+    """Read a Minari dataset whose observations are {"free": [T+1, F], "costly": [T+1, D]}; `episodes` None reads all.
 
     Raises TracesError when the folder is no such dataset, holds HDF5 links out of itself, or does not match the feature
     table in its metadata.
     """
-    if not (path / "data").is_dir():
-        raise TracesError(f"{path} is not a Minari dataset: it has no folder 'data'")
-    _refuse_links(path / "data")
-    dataset = minari.MinariDataset(path / "data")
-    metadata = dataset.storage.metadata
-    try:
-        features = msgspec.json.decode(_text(metadata["features"]), type=FeatureTable)
-        action = msgspec.json.decode(_text(metadata["action"]), type=ActionSpec)
-    except (KeyError, msgspec.ValidationError) as error:
-        raise TracesError(f"{path}: metadata must hold 'features' and 'action': {error}") from error
-    total = min(dataset.total_episodes, episodes or dataset.total_episodes)
+    dataset, features, action = _open(path)
+    total = dataset.total_episodes if episodes is None else min(dataset.total_episodes, episodes)
+    if total < 1:
+        raise TracesError(f"{path}: {total} of {dataset.total_episodes} episodes to read, expected 1 or more")
     free, costly, actions, togo, lengths = [], [], [], [], []
     for i in track(range(total), description=f"reading {path.name}"):
-        episode = dataset[i]
+        episode, where = dataset[i], f"{path}: episode {i}"
         n = len(episode.rewards)
-        _check_width(path, i, "free", episode.observations["free"], features.n_free)
-        _check_width(path, i, "costly", episode.observations["costly"], features.n_costly)
-        _check_width(path, i, "actions", episode.actions, action.size)
-        free.append(torch.from_numpy(episode.observations["free"][:n].astype(np.float32)))
-        costly.append(torch.from_numpy(episode.observations["costly"][:n].astype(np.float16)))
-        actions.append(torch.from_numpy(episode.actions.astype(np.float32)))
-        togo.append(torch.from_numpy(returns_to_go(np.asarray(episode.rewards))))
+        free.append(_rows(where, "free", episode.observations["free"][:n], (n, features.n_free), np.float32))
+        costly.append(_rows(where, "costly", episode.observations["costly"][:n], (n, features.n_costly), np.float16))
+        actions.append(_rows(where, "actions", episode.actions, (n, action.size), np.float32))
+        rewards = _rows(where, "rewards", np.asarray(episode.rewards), (n,), np.float64)
+        togo.append(torch.from_numpy(returns_to_go(rewards.numpy())))
         lengths.append(n)
     lengths_E = np.array(lengths, dtype=np.int64)
     starts_E = np.concatenate([[0], lengths_E.cumsum()[:-1]])
@@ -144,24 +135,50 @@ def draw_windows(traces: Traces, batch: int, length: int, generator: np.random.G
     )
 
 
+def _open(path: Path) -> tuple[minari.MinariDataset, FeatureTable, ActionSpec]:
+    data = path / "data"
+    if not (data / "metadata.json").is_file():
+        raise TracesError(f"{path} is not a Minari dataset: it has no data/metadata.json")
+    _refuse_links(data)
+    try:
+        metadata = json.loads((data / "metadata.json").read_bytes())
+        features = msgspec.json.decode(_text(metadata["features"]), type=FeatureTable)
+        action = msgspec.json.decode(_text(metadata["action"]), type=ActionSpec)
+        # Without both spaces minari would make the environment that the metadata name, and run code of their choice.
+        observed = set(json.loads(metadata["observation_space"])["subspaces"])
+        json.loads(metadata["action_space"])
+    except (KeyError, TypeError, ValueError, msgspec.DecodeError) as error:
+        raise TracesError(
+            f"{path}: metadata must hold 'features', 'action', 'observation_space' and 'action_space': {error}"
+        ) from error
+    if not {"free", "costly"} <= observed:
+        raise TracesError(f"{path}: observations hold {sorted(observed)}, expected 'free' and 'costly'")
+    return minari.MinariDataset(data), features, action
+
+
 def _text(value: object) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _check_width(path: Path, episode: int, name: str, array: NDArray[np.floating], expected: int) -> None:
-    if array.ndim != 2 or array.shape[1] != expected:
-        raise TracesError(f"{path}: episode {episode}: {name} has shape {array.shape}, expected [steps, {expected}]")
-    if not np.isfinite(array).all():
-        raise TracesError(f"{path}: episode {episode}: {name} has numbers that are not finite")
+def _rows(where: str, name: str, array: NDArray[np.floating], shape: tuple[int, ...], dtype: type) -> Tensor:
+    """The array as it is kept; numbers that do not fit `dtype` are refused like any that are not finite."""
+    if array.shape != shape:
+        raise TracesError(f"{where}: {name} has shape {array.shape}, expected {shape}")
+    with np.errstate(over="ignore"):
+        kept = array.astype(dtype)
+    if not np.isfinite(kept).all():
+        raise TracesError(f"{where}: {name} has numbers that are not finite as {np.dtype(dtype)}")
+    return torch.from_numpy(kept)
 
 
 def _refuse_links(folder: Path) -> None:
-    """An HDF5 file may point at other files; a dataset from outside must not (nor may its files be links)."""
+    """An HDF5 file may point at other files; a dataset from outside must not (nor may its files be links, nor its
+    groups form anything but a tree)."""
     for file in folder.glob("*.hdf5"):
         if file.is_symlink():
             raise TracesError(f"{file} is a symbolic link, expected a regular file")
         with h5py.File(file) as root:
-            groups = [root]
+            groups, seen = [root], {h5py.h5o.get_info(root.id).addr}
             while groups:
                 group = groups.pop()
                 for name in group:
@@ -170,6 +187,10 @@ def _refuse_links(folder: Path) -> None:
                         raise TracesError(f"{file}: {group.name}/{name} is a {type(link).__name__}, expected data")
                     child = group[name]
                     if isinstance(child, h5py.Group):
+                        address = h5py.h5o.get_info(child.id).addr
+                        if address in seen:
+                            raise TracesError(f"{file}: {group.name}/{name} is a group that has another place as well")
+                        seen.add(address)
                         groups.append(child)
                     elif child.external or child.is_virtual:
                         raise TracesError(f"{file}: {child.name} keeps its data in another file, expected it inside")

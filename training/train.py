@@ -1,8 +1,9 @@
 """Algorithm 1, from traces to a checkpoint: `python -m training.train --config training/configs/hard.json`.
 
-Reads top to bottom: configuration, traces, network, loop. Every update samples the queries (exactly, in parallel),
-takes one pass with gradients, and raises γ if the batch violated the budget. The run's folder holds what is needed to
-repeat it (config.json, versions.json), to go on with it (checkpoint.pt) and to judge it (metrics.jsonl, TensorBoard).
+Reads top to bottom: configuration, traces, network, loop. Every update samples the queries that the paper's sequential
+loop would sample, takes one pass with gradients, and raises γ if the batch violated the budget. The run's folder holds
+what is needed to repeat it (config.json, versions.json), to go on with it (checkpoint.pt) and to judge it
+(metrics.jsonl, TensorBoard).
 """
 
 from __future__ import annotations
@@ -46,10 +47,13 @@ class TrainState:
 
 
 def build_model(config: TrainConfig, traces: Traces) -> BudgetedDecisionTransformer:
-    """A network for these traces, normalised by them."""
+    """A network for these traces, normalised by them. Raises ValueError where the action layout is another."""
     components = traces.action.components
     if len(config.bins) != len(components):
         raise ValueError(f"bins has {len(config.bins)} numbers, the action has {len(components)} components")
+    names = [component.name for component in components]
+    if unknown := set(config.sampled) - set(names):
+        raise ValueError(f"sampled names {sorted(unknown)}, the action has {names}")
     model = BudgetedDecisionTransformer(
         ModelConfig(
             n_free=traces.features.n_free,
@@ -168,13 +172,14 @@ class _Run:
         self._config, self._state, self._held_out = config, state, held_out
         self._checkpoint, self._facts = checkpoint, facts
         self._sums: dict[str, float] = {}
+        self._summed = 0  # updates in the sums: fewer than log_every in the first line after a resume
         self._began = time.monotonic() - state.seconds
         metrics = config.out / "metrics.jsonl"
         if metrics.exists():  # lines that came after the checkpoint will come again
             kept = [line for line in metrics.read_text().splitlines(True) if json.loads(line)["update"] <= state.done]
             metrics.write_text("".join(kept))
         self._lines = metrics.open("a")
-        self._board = SummaryWriter(str(config.out))
+        self._board = SummaryWriter(str(config.out), purge_step=state.done + 1)
         columns = (*Progress.get_default_columns()[:2], TimeElapsedColumn(), TimeRemainingColumn())
         self._progress = Progress(*columns, TextColumn("{task.fields[now]}"))
         self._task = self._progress.add_task(config.name, total=config.updates, completed=state.done, now="")
@@ -194,13 +199,15 @@ class _Run:
         state.seconds = time.monotonic() - self._began
         for key, value in state.metrics.items():
             self._sums[key] = self._sums.get(key, 0.0) + value
+        self._summed += 1
         self._progress.update(self._task, completed=state.done)
         if state.done % config.log_every == 0:
-            means = {key: value / config.log_every for key, value in self._sums.items()}
+            means = {key: value / self._summed for key, value in self._sums.items()}
             if len(self._held_out.lengths_E):
                 means["held_out"] = held_out_loss(config, state.model, self._held_out)
             self._log(means)
             self._sums.clear()
+            self._summed = 0
         if state.done % config.checkpoint_every == 0 or state.done == config.updates:
             save_checkpoint(self._checkpoint, config, self._facts, state)
 

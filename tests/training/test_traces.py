@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -67,12 +68,29 @@ def test_moments_are_the_mean_and_a_floored_deviation() -> None:
     assert scale[1].item() == pytest.approx(0.0999, rel=1e-3)
 
 
+def test_moments_of_constants_can_be_divided_by() -> None:
+    """Numbers that never change in the traces; more rows than are summed at once."""
+    mean, scale = moments(torch.tensor([[0.0, 3.0]]).expand(70_000, 2))
+    assert mean.tolist() == [0.0, 3.0]
+    assert (scale > 0).all()
+    assert torch.isfinite((torch.ones(2) - mean) / scale).all()
+
+
 def test_refuses_links_out_of_the_file(dataset: Path, tmp_path: Path) -> None:
     bad = tmp_path / "bad"
     shutil.copytree(dataset, bad)
     with h5py.File(bad / "data" / "main_data.hdf5", "a") as root:
         root["episode_0"]["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/x")
     with pytest.raises(TracesError, match="ExternalLink, expected data"):
+        load_traces(bad)
+
+
+def test_refuses_groups_in_a_circle(dataset: Path, tmp_path: Path) -> None:
+    bad = tmp_path / "bad"
+    shutil.copytree(dataset, bad)
+    with h5py.File(bad / "data" / "main_data.hdf5", "a") as root:
+        root["episode_0"]["again"] = root["episode_0"]
+    with pytest.raises(TracesError, match="another place"):
         load_traces(bad)
 
 
@@ -91,10 +109,52 @@ def test_refuses_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
         load_traces(tmp_path)
 
 
-def test_refuses_numbers_that_are_not_finite(dataset: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("array", "place", "value", "message"),
+    [
+        ("observations/costly", (2, 1), np.nan, "costly has numbers that are not finite"),
+        ("observations/costly", (2, 1), 1e5, "costly has numbers that are not finite as float16"),
+        ("observations/free", (0, 0), np.inf, "free has numbers that are not finite"),
+        ("rewards", (1,), np.nan, "rewards has numbers that are not finite"),
+    ],
+)
+def test_refuses_numbers_that_cannot_be_kept(
+    dataset: Path, tmp_path: Path, array: str, place: tuple[int, ...], value: float, message: str
+) -> None:
     bad = tmp_path / "bad"
     shutil.copytree(dataset, bad)
     with h5py.File(bad / "data" / "main_data.hdf5", "a") as root:
-        root["episode_3"]["observations"]["costly"][2, 1] = np.nan
-    with pytest.raises(TracesError, match="episode 3: costly has numbers that are not finite"):
+        root["episode_3"][array][place] = value
+    with pytest.raises(TracesError, match=f"episode 3: {message}"):
         load_traces(bad)
+
+
+@pytest.mark.parametrize("array", ["observations/free", "observations/costly", "actions"])
+def test_refuses_arrays_of_different_length(dataset: Path, tmp_path: Path, array: str) -> None:
+    bad = tmp_path / "bad"
+    shutil.copytree(dataset, bad)
+    with h5py.File(bad / "data" / "main_data.hdf5", "a") as root:
+        short = root["episode_3"][array][:5]
+        del root["episode_3"][array]
+        root["episode_3"][array] = short
+    with pytest.raises(TracesError, match=f"episode 3: {array.split('/')[-1]} has shape"):
+        load_traces(bad)
+
+
+@pytest.mark.parametrize("key", ["features", "action", "observation_space", "action_space"])
+def test_refuses_metadata_that_lack_a_key(dataset: Path, tmp_path: Path, key: str) -> None:
+    """Without its spaces, minari would make the environment that the metadata name: any callable there is."""
+    bad = tmp_path / "bad"
+    shutil.copytree(dataset, bad)
+    file = bad / "data" / "metadata.json"
+    metadata = json.loads(file.read_text())
+    del metadata[key]
+    file.write_text(json.dumps(metadata))
+    with pytest.raises(TracesError, match=f"metadata must hold .*: '{key}'"):
+        load_traces(bad)
+
+
+@pytest.mark.parametrize("episodes", [0, -1])
+def test_refuses_to_read_nothing(dataset: Path, episodes: int) -> None:
+    with pytest.raises(TracesError, match="expected 1 or more"):
+        load_traces(dataset, episodes=episodes)

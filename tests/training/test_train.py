@@ -14,7 +14,7 @@ from training.acquisition import rollout, sample_queries
 from training.checkpoint import load_trained
 from training.config import TrainConfig
 from training.traces import load_traces
-from training.train import TrainState, train
+from training.train import TrainState, build_model, train
 
 
 def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Path, TrainState]) -> None:
@@ -41,7 +41,10 @@ def test_a_stopped_run_resumes_to_the_same_weights(dataset: Path, tmp_path: Path
     resumed = train(halves)
     assert resumed.done == 30
     assert resumed.penalty_weight == whole.penalty_weight
-    assert (tmp_path / "halves" / "metrics.jsonl").read_text().count("\n") == 3
+    lines = [json.loads(line) for line in (tmp_path / "halves" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["update"] for line in lines] == [10, 20, 30]
+    # Every update takes as many steps as its windows are long; a mean says so even where a resumed run cut it short.
+    assert [line["passes"] for line in lines] == [12.0] * 3
     for name, value in whole.model.state_dict().items():
         assert torch.equal(value, resumed.model.state_dict()[name]), name
 
@@ -87,14 +90,39 @@ def test_refuses_to_resume_with_other_settings(dataset: Path, tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("setting", "value", "message"),
-    [("budget", 1.5, "budget is 1.5"), ("width", 15, "not a multiple"), ("context_length", 1, "2 or more")],
+    [
+        ("budget", 1.5, "budget is 1.5"),
+        ("held_out", 1.0, "episodes to train on"),
+        ("warmup", 0, "warmup is 0"),
+        ("bins", (3, 1), "2 or more for each"),
+        ("width", 15, "not a multiple"),
+        ("context_length", 1, "2 or more"),
+    ],
 )
 def test_refuses_settings_that_cannot_be(dataset: Path, setting: str, value: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         toy.config(dataset, Path("nowhere"), **{setting: value})
 
 
-def test_unknown_settings_in_a_file_are_errors(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text('{"dataset": "a", "out": "b", "name": "c", "lerning_rate": 1}')
-    with pytest.raises(ValueError, match="lerning_rate"):
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"bins": (3,)}, "bins has 1 numbers"), ({"sampled": ("jmup",)}, "sampled names .'jmup'.")],
+)
+def test_refuses_settings_for_another_action(dataset: Path, settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build_model(toy.config(dataset, Path("nowhere"), **settings), load_traces(dataset))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"dataset": "a", "out": "b", "name": "c", "lerning_rate": 1}', "lerning_rate"),
+        ('{"dataset": "a", "out": "b", "name": "c", "seed": "x"}', "seed"),
+        ('{"dataset": "a", "out": "b", "name": "c", "budget": 2}', "budget is 2"),
+        ('{"dataset": "a"', "truncated"),
+    ],
+)
+def test_errors_in_a_file_name_the_file(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ValueError, match=f"config.json: .*{message}"):
         TrainConfig.read(tmp_path / "config.json")
