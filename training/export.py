@@ -18,6 +18,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import onnx
 import torch
 import tyro
 from rich.console import Console
@@ -92,7 +93,15 @@ def _write(
             optimize=True,
             verbose=False,
         )
-    program.save(path, external_data=False)
+    onnx.save(_without_traces(program.model_proto), path)
+
+
+def _without_traces(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The exporter notes on every node which source lines made it, with their full paths: not for a bundle."""
+    for part in (model, model.graph, *model.graph.node, *model.graph.value_info, *model.graph.initializer):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+    return model
 
 
 @torch.no_grad()

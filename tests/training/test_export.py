@@ -65,6 +65,11 @@ def test_served_bots_equal_torch_over_a_whole_episode(trained: tuple[Path, Train
     assert 0.05 < np.mean(queries) < 0.95
 
 
+def test_graphs_do_not_tell_where_they_were_made(bundle: Path) -> None:
+    for name in ("acquisition.onnx", "action.onnx"):
+        assert b".py" not in (bundle / name).read_bytes()
+
+
 def test_golden_episode_is_longer_than_the_context(bundle: Path) -> None:
     with np.load(bundle / "golden.npz") as golden:
         assert len(golden["free"]) > 2 * 5
