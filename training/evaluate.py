@@ -43,6 +43,12 @@ class EvaluateConfig:
     workers: int = os.cpu_count() or 1
     out: Path | None = None  # where evaluation.json goes (None: into the bundle's folder)
 
+    def __post_init__(self) -> None:
+        if min(self.episodes, self.workers) < 1:
+            raise ValueError(f"episodes is {self.episodes} and workers {self.workers}, expected 1 or more of each")
+        if self.budget is not None and not 0.0 <= self.budget <= 1.0:
+            raise ValueError(f"budget is {self.budget}, expected a share of the full cost in [0, 1]")
+
 
 @dataclass(frozen=True)
 class Episode:

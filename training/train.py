@@ -8,11 +8,11 @@ what is needed to repeat it (config.json, versions.json), to go on with it (chec
 
 from __future__ import annotations
 
+import argparse
 import importlib.metadata
 import json
 import math
 import platform
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -234,12 +234,10 @@ def _write_versions(path: Path, traces: Traces) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line: `--config FILE`, then any setting to override."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    default = None
-    if "--config" in arguments:
-        at = arguments.index("--config")
-        default = TrainConfig.read(Path(arguments[at + 1]))
-        arguments = arguments[:at] + arguments[at + 2 :]
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config", type=Path)
+    known, arguments = parser.parse_known_args(arguments)
+    default = None if known.config is None else TrainConfig.read(known.config)
     config = tyro.cli(TrainConfig, default=default, args=arguments, description=__doc__)
     train(config)
 

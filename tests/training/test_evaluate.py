@@ -53,3 +53,9 @@ def test_command_line_writes_what_it_prints(bundle: Path, tmp_path: Path) -> Non
 def test_a_bundle_without_an_environment_needs_one(bundle: Path) -> None:
     with pytest.raises(ValueError, match="names no environment"):
         evaluate(EvaluateConfig(bundle, episodes=1))
+
+
+@pytest.mark.parametrize("settings", [{"episodes": 0}, {"workers": 0}, {"budget": 1.5}, {"budget": float("nan")}])
+def test_refuses_settings_that_cannot_be(settings: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        EvaluateConfig(Path("nowhere"), **settings)

@@ -14,7 +14,7 @@ from training.acquisition import rollout, sample_queries
 from training.checkpoint import load_trained
 from training.config import TrainConfig
 from training.traces import load_traces
-from training.train import TrainState, build_model, train
+from training.train import TrainState, build_model, main, train
 
 
 def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Path, TrainState]) -> None:
@@ -126,3 +126,14 @@ def test_errors_in_a_file_name_the_file(tmp_path: Path, text: str, message: str)
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match=f"config.json: .*{message}"):
         TrainConfig.read(tmp_path / "config.json")
+
+
+def test_command_line_overrides_its_configuration_file(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toy.config(dataset, tmp_path / "run", updates=9).write(tmp_path / "config.json")
+    main([f"--config={tmp_path / 'config.json'}", "--updates", "2", "--log-every", "1"])
+    assert TrainConfig.read(tmp_path / "run" / "config.json").updates == 2
+    with pytest.raises(SystemExit):
+        main(["--config"])
+    assert "expected one argument" in capsys.readouterr().err
