@@ -112,8 +112,8 @@ class Player:
 class Kicks:
     """Disturbs what is executed for a few decisions now and then; what was intended is what gets recorded.
 
-    Often enough that where a character heads says little of what its player knows: an imitator that reads the player's
-    mind off its heading would walk into whatever it did not look at. Where a push could lead over a brink, a kick only
+    Often, so that where a character heads says less of what its player knows: an imitator that reads the player's mind
+    off its heading would walk into whatever it did not look at. Where a push could lead over a brink, a kick only
     turns the character on the spot.
     """
 
