@@ -52,7 +52,8 @@ def trained(bundle: Bundle, golden_probs_TM: np.ndarray) -> Source:
             low, high = (np.clip(limit, -100.0, 100.0) for limit in table.free_range)
             free = random.uniform(low, high, (n_bots, table.n_free))
             returns_to_go = random.uniform(-1.0, 1.0, n_bots) * manifest.target_return
-            probs = policy.query_probs(random.normal(0.0, 1.5, (n_bots, manifest.width)), free, returns_to_go)
+            hidden = random.normal(0.0, 1.5, (n_bots, manifest.width))
+            probs = policy.query_probs(hidden, free, returns_to_go, random.random(n_bots))
         return _priced(random, probs, declared.costs_us)
 
     return source

@@ -130,7 +130,7 @@ def _probe_batch(policy: Policy, manifest: Manifest) -> None:
     zeros = {n: np.zeros((n_bots, n), dtype=np.float32) for n in (table.n_free, table.n_costly, manifest.action.size)}
     returns_to_go_N = np.full(n_bots, manifest.target_return, dtype=np.float32)
     hidden_NW = np.zeros((n_bots, manifest.width), dtype=np.float32)
-    probs_NM = policy.query_probs(hidden_NW, zeros[table.n_free], returns_to_go_N)
+    probs_NM = policy.query_probs(hidden_NW, zeros[table.n_free], returns_to_go_N, np.zeros(n_bots, dtype=np.float32))
     head = (manifest.n_layers, n_bots, manifest.n_heads)
     empty = np.zeros((*head, manifest.n_slots, manifest.head_dim), dtype=np.float32)
     step = policy.act(

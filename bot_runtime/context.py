@@ -24,6 +24,8 @@ class Contexts:
 
     The ring holds S = K - 1 turns a bot; turn t lies in slot t mod S, and `ages` says how many turns ago each was
     written (K: empty). `turns` counts the turns that the context took; it is the t of the noise and of the ring.
+    Without a context S and W are 0: those arrays are empty, and the counter, the return-to-go and the last action are
+    all that is kept.
     """
 
     def __init__(self, manifest: Manifest, capacity: int) -> None:
@@ -97,11 +99,15 @@ class Contexts:
 
     def advance(self, slots_N: _Ints, step: Step) -> None:
         """Append one turn to each context."""
+        if self._n_slots:
+            self._remember(slots_N, step)
+        self._last_action_BA[slots_N] = step.action_NA
+        self._turns_B[slots_N] += 1
+
+    def _remember(self, slots_N: _Ints, step: Step) -> None:
         ring_N = self._turns_B[slots_N] % self._n_slots
         self._keys[:, slots_N, :, ring_N] = step.new_keys.swapaxes(0, 1)  # advanced indices put N first
         self._values[:, slots_N, :, ring_N] = step.new_values.swapaxes(0, 1)
         self._ages_BS[slots_N] = np.minimum(self._ages_BS[slots_N] + 1, self._empty_age)
         self._ages_BS[slots_N, ring_N] = 1
         self._hidden_BW[slots_N] = step.hidden_NW
-        self._last_action_BA[slots_N] = step.action_NA
-        self._turns_B[slots_N] += 1

@@ -40,8 +40,8 @@ def read_golden(content: bytes, manifest: Manifest) -> Golden:
     """The arrays of golden.npz, shapes and finiteness checked.
 
     T turns, more than the context length: `free` [T, F], `costly` [T, D] (every value), `rewards` [T], `probs` [T, M],
-    `queries` [T, M] of 0 and 1, `actions` [T, A], `hidden` [T, W], and the scalars `seed` and `target_return`.
-    Raises BadBundle.
+    `queries` [T, M] of 0 and 1, `actions` [T, A], with a context `hidden` [T, W], and the scalars `seed`,
+    `target_return` and, where the network is conditioned on it, `target_cost`. Raises BadBundle.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -67,15 +67,17 @@ def replay(policy: Policy, manifest: Manifest, golden: Golden) -> None:
     free_TF, costly_TD = golden["free"].astype(np.float32), golden["costly"].astype(np.float32)
     query_TM = golden["queries"].astype(np.bool_)
     costly_TD = np.where(query_TM[:, manifest.features.owner], costly_TD, np.float32(0.0))
+    target_cost_N = golden.get("target_cost", np.float32(0.0)).astype(np.float32).reshape(1)
     for turn in range(len(free_TF)):
         row = slice(turn, turn + 1)
         returns_to_go_N = returns_to_go_T[row].astype(np.float32)
-        probs_NM = policy.query_probs(contexts.hidden(_ONE_BOT), free_TF[row], returns_to_go_N)
+        probs_NM = policy.query_probs(contexts.hidden(_ONE_BOT), free_TF[row], returns_to_go_N, target_cost_N)
         noise_NA = _action_noise(contexts, manifest)
         cache, ages_NS = contexts.cache(_ONE_BOT), contexts.ages(_ONE_BOT)
         step = policy.act(free_TF[row], costly_TD[row], query_TM[row], returns_to_go_N, noise_NA, cache, ages_NS)
         for name, got in (("probs", probs_NM), ("actions", step.action_NA), ("hidden", step.hidden_NW)):
-            _compare(name, turn, got[0], golden[name][turn], manifest.tolerance)
+            if name in golden:
+                _compare(name, turn, got[0], golden[name][turn], manifest.tolerance)
         contexts.advance(_ONE_BOT, step)
 
 
@@ -104,8 +106,11 @@ def _check_shapes(arrays: Golden, manifest: Manifest) -> None:
         "probs": (turns, table.n_queries),
         "queries": (turns, table.n_queries),
         "actions": (turns, manifest.action.size),
-        "hidden": (turns, manifest.width),
     }
+    if manifest.has_context:
+        expected["hidden"] = (turns, manifest.width)
+    if manifest.is_conditioned:
+        expected["target_cost"] = ()
     if set(arrays) != set(expected):
         raise BadBundle(f"golden.npz holds {sorted(arrays)}, expected {sorted(expected)}")
     if turns <= manifest.context_length:

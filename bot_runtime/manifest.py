@@ -41,13 +41,15 @@ class FileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Schema 1 of `manifest.json`. Raises ValueError (msgspec turns it into ValidationError) when a field is illegal.
 
-    `budget` is the normalised C of the paper, in [0, 1]; 1 means unconstrained. `tolerance` is the largest |Δ| that
-    the golden replay accepts.
+    `budget` is the normalised C of the paper, in [0, 1]; 1 means unconstrained. `context_length` 1 means no context at
+    all: a network without memory, whose layers, heads and width are 0. `target_cost` is the share of the full cost
+    that a budget-conditioned network is asked for by default; None, and the network has no such input. `tolerance` is
+    the largest |Δ| that the golden replay accepts.
     """
 
     schema_version: Literal[1]
     name: str
-    method: Literal["bdt"]
+    method: Literal["bdt", "rcbc", "bc", "iql"]
     features: FeatureTable
     action: ActionSpec
     context_length: int
@@ -60,30 +62,48 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tolerance: float
     files: dict[str, FileEntry]
     provenance: dict[str, str]
+    target_cost: float | None = None
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
             raise ValueError(f"bundle name {self.name[:80]!r} does not match {_NAME.pattern}")
-        if not 2 <= self.context_length <= MAX_CONTEXT_LENGTH:
-            raise ValueError(f"context_length is {self.context_length}, expected 2 to {MAX_CONTEXT_LENGTH}")
-        for field in ("n_layers", "n_heads", "head_dim", "width"):
-            if not 1 <= getattr(self, field) <= _MAX_DIMENSION:
-                raise ValueError(f"{field} is {getattr(self, field)}, expected 1 to {_MAX_DIMENSION}")
-        if 2 * self.n_layers * self.n_heads * self.n_slots * self.head_dim > _MAX_CONTEXT_NUMBERS:
-            raise ValueError(f"one bot's keys and values are more than {_MAX_CONTEXT_NUMBERS} numbers")
+        self._check_context()
         if not math.isfinite(self.target_return):
             raise ValueError(f"target_return is {self.target_return}, expected a finite number")
         if not 0.0 <= self.budget <= 1.0:
             raise ValueError(f"budget is {self.budget}, expected 0 to 1")
+        if self.target_cost is not None and not 0.0 <= self.target_cost <= 1.0:
+            raise ValueError(f"target_cost is {self.target_cost}, expected 0 to 1 or null")
         if not 0.0 < self.tolerance <= MAX_TOLERANCE:
             raise ValueError(f"tolerance is {self.tolerance}, expected more than 0 and at most {MAX_TOLERANCE}")
         if set(self.files) != set(FILES):
             raise ValueError(f"files are {sorted(self.files)}, expected {sorted(FILES)}")
 
+    def _check_context(self) -> None:
+        if not 1 <= self.context_length <= MAX_CONTEXT_LENGTH:
+            raise ValueError(f"context_length is {self.context_length}, expected 1 to {MAX_CONTEXT_LENGTH}")
+        low, high = (1, _MAX_DIMENSION) if self.has_context else (0, 0)
+        for field in ("n_layers", "n_heads", "head_dim", "width"):
+            if not low <= getattr(self, field) <= high:
+                expected = f"{low} to {high} with context_length {self.context_length}"
+                raise ValueError(f"{field} is {getattr(self, field)}, expected {expected}")
+        if 2 * self.n_layers * self.n_heads * self.n_slots * self.head_dim > _MAX_CONTEXT_NUMBERS:
+            raise ValueError(f"one bot's keys and values are more than {_MAX_CONTEXT_NUMBERS} numbers")
+
     @property
     def n_slots(self) -> int:
         """S: how many past turns the key/value cache holds, K - 1."""
         return self.context_length - 1
+
+    @property
+    def has_context(self) -> bool:
+        """Whether the network remembers earlier frames: it then has a hidden state, keys and values."""
+        return self.context_length > 1
+
+    @property
+    def is_conditioned(self) -> bool:
+        """Whether the acquisition head reads a target cost, so that one network serves every budget."""
+        return self.target_cost is not None
 
     @property
     def is_unlimited(self) -> bool:

@@ -34,7 +34,10 @@ class Cache(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What one turn computed: action [N, A], hidden [N, W], and the turn's own keys and values, each [L, N, H, d]."""
+    """What one turn computed: action [N, A], hidden [N, W], and the turn's own keys and values, each [L, N, H, d].
+
+    Without a context W, L, H and d are 0: there is nothing but the action.
+    """
 
     action_NA: Floats
     hidden_NW: Floats
@@ -59,14 +62,23 @@ class Policy:
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
         self._acquisition = _session("acquisition.onnx", bundle.acquisition, threads)
         self._action = _session("action.onnx", bundle.action, threads)
+        self._has_context, self._is_conditioned = bundle.manifest.has_context, bundle.manifest.is_conditioned
         inputs, outputs = _acquisition_ports(bundle.manifest)
         _check_ports("acquisition.onnx", self._acquisition, inputs, outputs)
         inputs, outputs = _action_ports(bundle.manifest)
         _check_ports("action.onnx", self._action, inputs, outputs)
 
-    def query_probs(self, hidden_NW: Floats, free_NF: Floats, returns_to_go_N: Floats) -> Floats:
-        """Bernoulli means of each bot's query, shape [N, M] (π̂ of the paper, reading the state after the last turn)."""
-        feed = {"hidden": hidden_NW, "free": free_NF, "returns_to_go": returns_to_go_N[:, None]}
+    def query_probs(self, hidden_NW: Floats, free_NF: Floats, returns_to_go_N: Floats, target_cost_N: Floats) -> Floats:
+        """Bernoulli means of each bot's query, shape [N, M] (π̂ of the paper, reading the state after the last turn).
+
+        `target_cost_N` are shares of each bot's full cost in [0, 1], of no effect unless the network is conditioned on
+        them; `hidden_NW` has no columns where the network has no context.
+        """
+        feed = {"free": free_NF, "returns_to_go": returns_to_go_N[:, None]}
+        if self._has_context:
+            feed["hidden"] = hidden_NW
+        if self._is_conditioned:
+            feed["target_cost"] = target_cost_N[:, None]
         probs_NM: Floats = self._acquisition.run(["query_probs"], _float32(feed))[0]
         return probs_NM
 
@@ -82,7 +94,8 @@ class Policy:
     ) -> Step:
         """One incremental trunk step for every bot (π̃ of the paper).
 
-        `costly_ND` is zero where not acquired, `query_NM` is what was acquired, `noise_NA` is uniform in [0, 1).
+        `costly_ND` is zero where not acquired, `query_NM` is what was acquired, `noise_NA` is uniform in [0, 1). A
+        network without a context reads neither `cache` nor `ages_NS`.
         """
         feed = {
             "free": free_NF,
@@ -90,10 +103,12 @@ class Policy:
             "query": query_NM,
             "returns_to_go": returns_to_go_N[:, None],
             "noise": noise_NA,
-            "keys": cache.keys,
-            "values": cache.values,
         }
-        arrays = _float32(feed)
+        if not self._has_context:
+            (action_NA,) = self._action.run(["action"], _float32(feed))
+            nothing = np.zeros((0, len(action_NA), 0, 0), dtype=np.float32)
+            return Step(action_NA, np.zeros((len(action_NA), 0), dtype=np.float32), nothing, nothing)
+        arrays = _float32(feed | cache._asdict())
         arrays["ages"] = np.ascontiguousarray(ages_NS, dtype=np.int64)
         return Step(*self._action.run(["action", "hidden", "new_keys", "new_values"], arrays))
 
@@ -120,26 +135,31 @@ def _session(file: str, graph: bytes, threads: int) -> ort.InferenceSession:
 
 def _acquisition_ports(manifest: Manifest) -> tuple[dict[str, _Port], dict[str, _Port]]:
     table = manifest.features
-    inputs = {"hidden": _floats(manifest.width), "free": _floats(table.n_free), "returns_to_go": _floats(1)}
+    inputs = {"free": _floats(table.n_free), "returns_to_go": _floats(1)}
+    if manifest.has_context:
+        inputs["hidden"] = _floats(manifest.width)
+    if manifest.is_conditioned:
+        inputs["target_cost"] = _floats(1)
     return inputs, {"query_probs": _floats(table.n_queries)}
 
 
 def _action_ports(manifest: Manifest) -> tuple[dict[str, _Port], dict[str, _Port]]:
-    table, head = manifest.features, (manifest.n_heads, manifest.n_slots, manifest.head_dim)
-    cache: _Port = ("tensor(float)", (manifest.n_layers, None, *head))
-    token: _Port = ("tensor(float)", (manifest.n_layers, None, manifest.n_heads, manifest.head_dim))
+    table = manifest.features
     inputs: dict[str, _Port] = {
         "free": _floats(table.n_free),
         "costly": _floats(table.n_costly),
         "query": _floats(table.n_queries),
         "returns_to_go": _floats(1),
         "noise": _floats(manifest.action.size),
-        "keys": cache,
-        "values": cache,
-        "ages": ("tensor(int64)", (None, manifest.n_slots)),
     }
-    outputs = {"action": _floats(manifest.action.size), "hidden": _floats(manifest.width)}
-    return inputs, {**outputs, "new_keys": token, "new_values": token}
+    outputs: dict[str, _Port] = {"action": _floats(manifest.action.size)}
+    if manifest.has_context:
+        layers, heads, slots, dim = manifest.n_layers, manifest.n_heads, manifest.n_slots, manifest.head_dim
+        cache: _Port = ("tensor(float)", (layers, None, heads, slots, dim))
+        token: _Port = ("tensor(float)", (layers, None, heads, dim))
+        inputs |= {"keys": cache, "values": cache, "ages": ("tensor(int64)", (None, slots))}
+        outputs |= {"hidden": _floats(manifest.width), "new_keys": token, "new_values": token}
+    return inputs, outputs
 
 
 def _floats(columns: int) -> _Port:

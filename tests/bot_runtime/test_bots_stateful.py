@@ -60,7 +60,7 @@ class Reference:
 
     def probs(self, bot: ReferenceBot, free: np.ndarray, left: float) -> np.ndarray:
         hidden = np.zeros(self.manifest.width) if bot.hidden is None else bot.hidden
-        return self.policy.query_probs(hidden[None], free[None], np.array([left]))
+        return self.policy.query_probs(hidden[None], free[None], np.array([left]), np.ones(1))
 
     def act(self, bot: ReferenceBot, free: np.ndarray, costly: np.ndarray, query: np.ndarray) -> np.ndarray:
         m = self.manifest

@@ -82,7 +82,7 @@ def test_missing_linked_or_not_a_file(copy: Path, file: str) -> None:
         {"name": "Tiny"},
         {"name": "tiny\n"},
         {"name": "a" * 65},
-        {"method": "iql"},
+        {"method": "ppo"},
         {"context_length": 1},
         {"context_length": 10**6},
         {"n_layers": 0},

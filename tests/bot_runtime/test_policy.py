@@ -72,7 +72,7 @@ def test_rows_are_separate(bundle: Bundle) -> None:
 @pytest.mark.parametrize("name", ["hidden", "free", "returns_to_go"])
 def test_every_input_of_the_acquisition_graph_matters(bundle: Bundle, name: str) -> None:
     policy, manifest = Policy(bundle), bundle.manifest
-    feed = [np.ones((1, manifest.width)), np.ones((1, manifest.features.n_free)), np.ones(1)]
+    feed = [np.ones((1, manifest.width)), np.ones((1, manifest.features.n_free)), np.ones(1), np.zeros(1)]
     before = policy.query_probs(*feed)
     feed[["hidden", "free", "returns_to_go"].index(name)] += 1.0
     assert before.shape == (1, manifest.features.n_queries)
