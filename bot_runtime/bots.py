@@ -21,15 +21,15 @@ from bot_runtime.fallback import Counters, fallback_actions
 from bot_runtime.noise import uniforms
 from bot_runtime.policy import Policy, Step
 from bot_runtime.slots import Slots
+from bot_runtime.spending import Limits, Spending
 from bot_runtime.turns import Actions, Queries, Turn, Turns
 from protocol.errors import BadSchema, FrameReused
 from protocol.features import CostModel
 
 __all__ = ["Bots"]
 
-_MAX_BUDGET_US = 1e9
-_NO_NUMBERS = np.zeros(0)
 _Handles = NDArray[np.int64]
+_Numbers = Sequence[float] | NDArray[np.floating] | None
 
 
 class Bots:
@@ -57,9 +57,7 @@ class Bots:
         self._slots = Slots(max_bots, first_generation=generation)
         self._contexts = Contexts(bundle.manifest, max_bots)
         self._turns = Turns(max_bots, self.counters)
-        self._costs_BM = np.zeros((max_bots, bundle.manifest.features.n_queries))
-        self._calls_B = np.zeros(max_bots)
-        self._budgets_B = np.zeros(max_bots)
+        self._spending = Spending(bundle.manifest, max_bots)
         self._started = 0
         components = bundle.manifest.action.components
         self._low_A = np.array([component.low for component in components], dtype=np.float32)
@@ -80,35 +78,32 @@ class Bots:
         count: int,
         *,
         seeds: Sequence[int] | NDArray[np.uint64] | None = None,
-        target_returns: Sequence[float] | NDArray[np.float64] | None = None,
-        budgets_us: Sequence[float] | NDArray[np.float64] | None = None,
+        target_returns: _Numbers = None,
+        budgets_us: _Numbers = None,
+        target_costs_us: _Numbers = None,
         cost_model: CostModel | None = None,
     ) -> _Handles:
         """Start bots and return their handles, int64 [count].
 
         Defaults: the n-th bot started here has seed n; the bundle's target return and budget (none at all when it
-        was trained without a limit); the costs that the feature table declares. Raises BadSchema, BadShape, NonFinite,
-        OutOfRange, TooManyBots.
+        was trained without a limit); the costs that the feature table declares; a target cost as large as the budget,
+        where one is given, else the bundle's. Raises BadSchema, BadShape, NonFinite, OutOfRange, TooManyBots.
         """
         if count < 1:
             raise BadSchema(f"count is {count}, expected at least 1")
         manifest, limit = self.bundle.manifest, inputs.MAX_RETURN
         model = cost_model or CostModel.declared(manifest.features)
         inputs.check_costs(model, manifest.features)
-        default_us = np.inf if manifest.is_unlimited else manifest.budget_us
-        targets_N, budgets_N = np.full(count, manifest.target_return), np.full(count, default_us)
+        returns_N = np.full(count, manifest.target_return)
         if target_returns is not None:
-            targets_N = inputs.per_bot("target_returns", target_returns, count, -limit, limit)
-        if budgets_us is not None:
-            budgets_N = inputs.per_bot("budgets_us", budgets_us, count, 0.0, _MAX_BUDGET_US)
+            returns_N = inputs.per_bot("target_returns", target_returns, count, -limit, limit)
+        limits = Limits.checked(count, budgets_us, target_costs_us)
         numbered = range(self._started, self._started + count)
         seeds_N = inputs.seeds(numbered if seeds is None else seeds, count)
         slots_N = self._slots.take(count)
         self._started += count
-        self._contexts.begin(slots_N, seeds_N, targets_N)
-        self._costs_BM[slots_N] = model.costs_us
-        self._calls_B[slots_N] = model.call_us
-        self._budgets_B[slots_N] = budgets_N
+        self._contexts.begin(slots_N, seeds_N, returns_N)
+        self._spending.begin(slots_N, model, limits)
         return self._slots.handles(slots_N)
 
     def request_queries(
@@ -116,13 +111,17 @@ class Bots:
         handles: _Handles,
         frame: int,
         free_NF: NDArray[np.float32],
-        rewards_N: Sequence[float] | NDArray[np.floating] | None = None,
+        rewards_N: _Numbers = None,
         frame_budget_us: float | None = None,
+        budgets_us: _Numbers = None,
+        target_costs_us: _Numbers = None,
     ) -> Queries:
         """What each bot asks for in this frame, within its own budget and, together, within `frame_budget_us`.
 
-        `rewards_N` came since each bot's last frame and leave its return-to-go, once. A newer frame abandons a
-        pending query. Raises BadShape, BadSchema, NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
+        `rewards_N` came since each bot's last frame and leave its return-to-go, once. `budgets_us` and
+        `target_costs_us`, one number a bot, replace those of the bots' start for this frame only; how they make the
+        network's target cost is `Spending.terms`. A newer frame abandons a pending query. Raises BadShape, BadSchema,
+        NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
         """
         slots_N = self._slots.resolve(handles)
         inputs.check_frame(frame)
@@ -131,15 +130,13 @@ class Bots:
         limit = inputs.MAX_RETURN
         rewards_N = np.zeros(handles.size) if rewards_N is None else rewards_N
         rewards_N = inputs.per_bot("rewards", rewards_N, handles.size, -limit, limit)
-        shared_us = _NO_NUMBERS
-        if frame_budget_us is not None:
-            shared_us = inputs.per_bot("frame_budget_us", (frame_budget_us,), 1, 0.0, _MAX_BUDGET_US)
-        request = (free_NF.copy(), rewards_N, shared_us)
+        limits = Limits.checked(handles.size, budgets_us, target_costs_us, frame_budget_us)
+        request = (free_NF.copy(), rewards_N, *limits)
         if retried is not None:
             _check_same(request, retried.request, frame)
             return retried.queries
         returns_to_go_N = self._contexts.returns_to_go(slots_N) - rewards_N
-        turn = self._ask(handles, slots_N, frame, request, returns_to_go_N.astype(np.float32), frame_budget_us)
+        turn = self._ask(handles, slots_N, frame, request, returns_to_go_N.astype(np.float32), limits)
         self._contexts.spend(slots_N, returns_to_go_N)
         self._turns.begin(slots_N, turn)
         return turn.queries
@@ -179,8 +176,7 @@ class Bots:
         slots_N = self._slots.resolve(handles)
         self._turns.leave(slots_N)
         self._contexts.clear(slots_N)
-        for array in (self._costs_BM, self._calls_B, self._budgets_B):
-            array[slots_N] = 0.0
+        self._spending.clear(slots_N)
         self._slots.release(slots_N)
         return int(slots_N.size)
 
@@ -191,20 +187,20 @@ class Bots:
         frame: int,
         request: tuple[NDArray[np.generic], ...],
         returns_to_go_N: NDArray[np.float32],
-        frame_budget_us: float | None,
+        limits: Limits,
     ) -> Turn:
         """Compute a turn's first half without changing any bot."""
         manifest, free_NF = self.bundle.manifest, request[0].astype(np.float32, copy=False)
-        n_queries = manifest.features.n_queries
+        n_queries, hidden_NW = manifest.features.n_queries, self._contexts.hidden(slots_N)
+        costs_NM, calls_N, budgets_N, target_cost_N = self._spending.terms(slots_N, limits)
         started_ns = self._clock()
-        probs_NM = self._policy.query_probs(self._contexts.hidden(slots_N), free_NF, returns_to_go_N)
+        probs_NM = self._policy.query_probs(hidden_NW, free_NF, returns_to_go_N, target_cost_N)
         infer_us = (self._clock() - started_ns) / 1e3
         asks_N = np.logical_and.reduce(np.isfinite(probs_NM), axis=1)
         seeds_N, turns_N = self._contexts.seeds(slots_N), self._contexts.turns(slots_N)
         noise = uniforms(seeds_N, turns_N, n_queries + manifest.action.size)
         sampled_NM = (noise[:, :n_queries] < probs_NM) & asks_N[:, None]
-        costs_NM, calls_N = self._costs_BM[slots_N], self._calls_B[slots_N]
-        query_NM = allocate(probs_NM, sampled_NM, costs_NM, calls_N, self._budgets_B[slots_N], frame_budget_us)
+        query_NM = allocate(probs_NM, sampled_NM, costs_NM, calls_N, budgets_N, limits.frame_budget_us)
         cost_us_N = np.where(query_NM, costs_NM, 0.0).sum(axis=1) + np.where(query_NM.any(axis=1), calls_N, 0.0)
         _freeze(query_NM, cost_us_N, probs_NM)
         queries = Queries(frame, query_NM, cost_us_N, probs_NM, infer_us)

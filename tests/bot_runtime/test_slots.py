@@ -61,8 +61,9 @@ def test_a_freed_slot_is_zeroed(engine: Engine) -> None:
     for name, array in vars(fresh._contexts).items():
         if isinstance(array, np.ndarray) and name != "_gathered":
             assert np.array_equal(array, getattr(engine.bots._contexts, name)), name
-    assert not engine.bots._budgets_B.any()
-    assert not engine.bots._costs_BM.any()
+    spending = {name: array for name, array in vars(engine.bots._spending).items() if isinstance(array, np.ndarray)}
+    assert len(spending) == 5
+    assert not any(array.any() for array in spending.values())
     engine.turn(engine.bots.start(8), 0)  # an earlier frame than the slots' last bots saw
 
 
