@@ -60,6 +60,7 @@ class BotClient:
         seeds: Sequence[int] | None = None,
         target_returns: Sequence[float] | None = None,
         budgets_us: Sequence[float] | None = None,
+        target_costs_us: Sequence[float] | None = None,
     ) -> NDArray[np.int64]:
         """Start bots; each sequence, where given, has one entry a bot. Returns their handles, int64 [count]."""
         message: dict[str, Any] = {"type": "start_bots", "count": int(count)}
@@ -67,6 +68,7 @@ class BotClient:
             message["seeds"] = [int(seed) for seed in seeds]
         _add_numbers(message, "target_returns", target_returns)
         _add_numbers(message, "budgets_us", budgets_us)
+        _add_numbers(message, "target_costs_us", target_costs_us)
         return np.array(self.exchange(message)["bots"], dtype=np.int64)
 
     def query(
@@ -76,10 +78,13 @@ class BotClient:
         free: ArrayLike,
         rewards: ArrayLike | None = None,
         frame_budget_us: float | None = None,
+        budgets_us: ArrayLike | None = None,
+        target_costs_us: ArrayLike | None = None,
     ) -> Queries:
         """Ask which costly features to acquire, given `free` [N, F] and the `rewards` [N] since each bot's last frame.
 
-        `frame_budget_us` is shared by all these bots, on top of each bot's own budget. Raises BadShape locally too.
+        `frame_budget_us` is shared by all these bots, on top of each bot's own budget. `budgets_us` and
+        `target_costs_us` [N] replace those of the bots' start for this frame only. Raises BadShape locally too.
         """
         table = self._connected().features
         handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
@@ -88,6 +93,8 @@ class BotClient:
         _add_numbers(message, "rewards", rewards)
         if frame_budget_us is not None:
             message["frame_budget_us"] = float(frame_budget_us)
+        _add_numbers(message, "budgets_us", budgets_us)
+        _add_numbers(message, "target_costs_us", target_costs_us)
         return read_queries(self._framed(message), len(handles), table)
 
     def act(

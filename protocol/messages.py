@@ -66,7 +66,10 @@ class Hello(_Message, frozen=True, tag="hello"):
 
 
 class Welcome(_Message, frozen=True, tag="welcome"):
-    """The connection's name, what is served, what it costs and every limit. `budget_us` is a bot's default budget."""
+    """The connection's name, what is served, what it costs and every limit.
+
+    `budget_us` is a bot's default budget, `target_cost_us` its default target cost, null where the bundle has none.
+    """
 
     connection: str
     bundle: str
@@ -77,6 +80,7 @@ class Welcome(_Message, frozen=True, tag="welcome"):
     context_length: int
     max_bots: int
     max_body_bytes: int
+    target_cost_us: float | None = None
 
 
 class StartBots(_Message, frozen=True, tag="start_bots"):
@@ -86,6 +90,7 @@ class StartBots(_Message, frozen=True, tag="start_bots"):
     seeds: Annotated[list[_Seed], Meta(max_length=MAX_BOTS_PER_MESSAGE)] | None = None
     target_returns: _PerBot | None = None
     budgets_us: _PerBot | None = None
+    target_costs_us: _PerBot | None = None
 
 
 class BotsStarted(_Message, frozen=True, tag="bots_started"):
@@ -97,7 +102,8 @@ class BotsStarted(_Message, frozen=True, tag="bots_started"):
 class RequestQueries(_Message, frozen=True, tag="request_queries"):
     """Ask which costly features to acquire. `free` is [N, F]; `rewards` [N] came since each bot's last frame.
 
-    `frame_budget_us` is shared by all bots of the message, on top of each bot's own budget.
+    `frame_budget_us` is shared by all bots of the message, on top of each bot's own budget. `budgets_us` and
+    `target_costs_us` [N] replace those of the bots' start for this frame only.
     """
 
     frame: _Frame
@@ -105,6 +111,8 @@ class RequestQueries(_Message, frozen=True, tag="request_queries"):
     free: Blob
     rewards: _PerBot | None = None
     frame_budget_us: float | None = None
+    budgets_us: _PerBot | None = None
+    target_costs_us: _PerBot | None = None
 
 
 class Queries(_Message, frozen=True, tag="queries"):

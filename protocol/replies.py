@@ -32,7 +32,10 @@ _REPLY_TO = {
 
 
 class Welcome(NamedTuple):
-    """What the server answers to hello: its bundle's features, action, costs and limits."""
+    """What the server answers to hello: its bundle's features, action, costs and limits.
+
+    `target_cost_us` is None where the bundle is not conditioned on its budget, and from a server without that field.
+    """
 
     connection: str
     bundle: str
@@ -43,6 +46,7 @@ class Welcome(NamedTuple):
     context_length: int
     max_bots: int
     max_body_bytes: int
+    target_cost_us: float | None = None
 
 
 class Queries(NamedTuple):
@@ -78,6 +82,7 @@ def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
 def read_welcome(reply: dict[str, Any]) -> Welcome:
     """The fields of a `welcome`; raises ReplyError."""
     with _reading("hello"):
+        target_cost_us = reply.get("target_cost_us")
         return Welcome(
             connection=str(reply["connection"]),
             bundle=str(reply["bundle"]),
@@ -90,6 +95,7 @@ def read_welcome(reply: dict[str, Any]) -> Welcome:
             context_length=int(reply["context_length"]),
             max_bots=int(reply["max_bots"]),
             max_body_bytes=int(reply["max_body_bytes"]),
+            target_cost_us=None if target_cost_us is None else float(target_cost_us),
         )
 
 

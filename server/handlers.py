@@ -95,6 +95,7 @@ class Handlers:
         check_costs(cost_model, self._table)
         self.end_silent()
         budget_us = cost_model.full_us if self._manifest.is_unlimited else self._manifest.budget_us
+        target_cost = self._manifest.target_cost
         return Welcome(
             connection=self._connections.open(cost_model).id,
             bundle=self._manifest.name,
@@ -105,6 +106,7 @@ class Handlers:
             context_length=self._manifest.context_length,
             max_bots=self._bots.max_bots,
             max_body_bytes=self.max_body_bytes[form],
+            target_cost_us=None if target_cost is None else target_cost * cost_model.full_us,
         )
 
     def _start_bots(self, request: StartBots, connection: Connection) -> BotsStarted:
@@ -113,6 +115,7 @@ class Handlers:
             seeds=request.seeds,
             target_returns=request.target_returns,
             budgets_us=request.budgets_us,
+            target_costs_us=request.target_costs_us,
             cost_model=connection.cost_model,
         ).tolist()
         connection.bots.update(handles)
@@ -122,7 +125,15 @@ class Handlers:
         connection.check_owns(request.bots)
         free_NF = arrays.floats(request.free, (len(request.bots), self._table.n_free), "free")
         handles_N = np.array(request.bots, dtype=np.int64)
-        turn = self._bots.request_queries(handles_N, request.frame, free_NF, request.rewards, request.frame_budget_us)
+        turn = self._bots.request_queries(
+            handles_N,
+            request.frame,
+            free_NF,
+            request.rewards,
+            request.frame_budget_us,
+            request.budgets_us,
+            request.target_costs_us,
+        )
         queries = arrays.pack_bits(turn.query_NM, form)
         return Queries(frame=turn.frame, queries=queries, cost_us=turn.cost_us_N.tolist(), infer_us=turn.infer_us)
 

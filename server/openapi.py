@@ -82,6 +82,7 @@ def summary(manifest: Manifest) -> bytes:
             "target_return": manifest.target_return,
             "budget": manifest.budget,
             "budget_us": manifest.budget_us,
+            "target_cost": manifest.target_cost,
             "full_cost_us": float(manifest.features.costs_us.sum()),
             "free_numbers": manifest.features.n_free,
             "costly_features": manifest.features.n_queries,

@@ -46,6 +46,7 @@ REQUESTS: dict[str, dict[str, Any]] = {
         "seeds": [1, 2**63 - 1],
         "target_returns": [100.0, 50.5],
         "budgets_us": [20.0, 0.0],
+        "target_costs_us": [4.5, 0.0],
     },
     "request_queries": {"type": "request_queries", "frame": 0, "bots": _BOTS[:1], "free": _FREE[:1]},
     "request_queries_all": {
@@ -55,6 +56,8 @@ REQUESTS: dict[str, dict[str, Any]] = {
         "free": _FREE,
         "rewards": [0.5, -1.0],
         "frame_budget_us": 25.0,
+        "budgets_us": [20.0, 1e9],
+        "target_costs_us": [0.25, 18.0],
     },
     "submit_features": {**_SUBMIT, "values": [[10.0, 1.0, 8.5, 9.5], [0.1]]},
     "submit_features_failed": {
@@ -66,19 +69,22 @@ REQUESTS: dict[str, dict[str, Any]] = {
     "stop_bots": {"type": "stop_bots", "bots": _BOTS},
     "goodbye": {"type": "goodbye"},
 }
+_WELCOME = {
+    "type": "welcome",
+    "connection": "00112233445566778899aabbccddeeff",
+    "bundle": "golden",
+    "features": {"features": _FEATURES},
+    "action": {"components": _ACTION},
+    "cost_model": _COST_MODEL,
+    "budget_us": 9.0,
+    "context_length": 20,
+    "max_bots": 256,
+    "max_body_bytes": 65536,
+    "target_cost_us": None,
+}
 REPLIES: dict[str, dict[str, Any]] = {
-    "welcome": {
-        "type": "welcome",
-        "connection": "00112233445566778899aabbccddeeff",
-        "bundle": "golden",
-        "features": {"features": _FEATURES},
-        "action": {"components": _ACTION},
-        "cost_model": _COST_MODEL,
-        "budget_us": 9.0,
-        "context_length": 20,
-        "max_bots": 256,
-        "max_body_bytes": 65536,
-    },
+    "welcome": _WELCOME,
+    "welcome_no_context_target_cost": {**_WELCOME, "context_length": 1, "target_cost_us": 6.8},
     "bots_started": {"type": "bots_started", "bots": _BOTS},
     "queries": {"type": "queries", "frame": 7, "queries": _QUERIES, "cost_us": [23.5, 17.5], "infer_us": 80.25},
     "actions": {

@@ -177,6 +177,11 @@ def test_codes_and_fields_of_a_newer_server() -> None:
     assert read_welcome(newer).features == TABLE
 
 
+def test_a_welcome_of_a_server_without_target_costs() -> None:
+    older = {name: value for name, value in VECTORS["welcome"].message.items() if name != "target_cost_us"}
+    assert read_welcome(older).target_cost_us is None
+
+
 def test_an_array_bomb_takes_no_more_memory_than_its_bytes_could_fill() -> None:
     bomb = b"\xdd\x00\x01\x00\x00" * 800  # arrays in arrays that claim 65,536 entries each
     tracemalloc.start()

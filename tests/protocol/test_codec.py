@@ -140,7 +140,13 @@ def test_the_widest_messages_fit_the_limit(max_bots: int) -> None:
     wide, handle = -1.2345678901234567e-300, 2**63 - 1
     bots = [handle] * max_bots
     messages = [
-        {"free": [[wide] * TABLE.n_free] * max_bots, "bots": bots, "rewards": [wide] * max_bots, "frame": MAX_FRAME},
+        {
+            "bots": bots,
+            "frame": MAX_FRAME,
+            "free": [[wide] * TABLE.n_free] * max_bots,
+            "frame_budget_us": wide,
+            **{name: [wide] * max_bots for name in ("rewards", "budgets_us", "target_costs_us")},
+        },
         {
             "bots": bots,
             "frame": MAX_FRAME,
@@ -148,7 +154,11 @@ def test_the_widest_messages_fit_the_limit(max_bots: int) -> None:
             "values": [[wide] * TABLE.n_costly] * max_bots,
             "failed": [[0] * TABLE.n_queries] * max_bots,
         },
-        {"count": max_bots, "seeds": bots, "target_returns": [wide] * max_bots, "budgets_us": [wide] * max_bots},
+        {
+            "count": max_bots,
+            "seeds": bots,
+            **{name: [wide] * max_bots for name in ("target_returns", "budgets_us", "target_costs_us")},
+        },
         {"token": "\x01" * 1024, "cost_model": {"call_us": wide, "feature_us": [wide] * TABLE.n_queries}},
     ]
     for message in messages:

@@ -15,7 +15,7 @@ from protocol import arrays, codec
 from protocol.client import BotClient
 from protocol.codec import Format
 from protocol.errors import ProtocolError
-from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures
+from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures, Welcome
 from protocol.replies import read_actions, read_queries, read_reply, read_welcome
 from protocol.vectors.__main__ import write_vectors
 from tests.protocol.golden import BOTS, FOLDER, REFUSED, REPLIES, REQUESTS, TABLE, VECTORS, WELCOME, Vector
@@ -141,7 +141,7 @@ def test_the_client_writes_requests_byte_for_byte() -> None:
     client, recorder = _client()
     client.hello(cost_model=WELCOME.cost_model, token="s3cret é")
     client.start(2)
-    client.start(2, seeds=[1, 2**63 - 1], target_returns=[100, 50.5], budgets_us=[20, 0])
+    client.start(2, seeds=[1, 2**63 - 1], target_returns=[100, 50.5], budgets_us=[20, 0], target_costs_us=[4.5, 0])
     client.act(**_submission(VECTORS["submit_features"]))
     client.act(**_submission(VECTORS["submit_features_failed"]))
     client.stop(BOTS)
@@ -161,8 +161,10 @@ def test_the_client_writes_queries_byte_for_byte_and_refuses_another_frames_answ
 
 
 def test_the_client_reads_replies_field_for_field() -> None:
-    welcome = read_welcome(read_reply(VECTORS["welcome"].body, "hello"))
-    assert welcome._asdict() == {name: getattr(WELCOME, name) for name in welcome._fields}
+    for name in ("welcome", "welcome_no_context_target_cost"):
+        welcome = read_welcome(read_reply(VECTORS[name].body, "hello"))
+        said = msgspec.convert(VECTORS[name].message, Welcome)
+        assert welcome._asdict() == {name: getattr(said, name) for name in welcome._fields}
     assert read_reply(VECTORS["bots_started"].body, "start_bots")["bots"] == BOTS
     said = VECTORS["queries"].message
     queries = read_queries(read_reply(VECTORS["queries"].body, "request_queries"), 2, TABLE)
