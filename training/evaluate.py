@@ -6,6 +6,7 @@ never sees. This module knows nothing about torch.
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import sys
@@ -13,54 +14,46 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import gymnasium
 import msgspec
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
-from protocol.features import CostModel
+from bot_runtime.manifest import Manifest
+from training.heat_map import HeatSums
+from training.play import Episode, Group, Player, Terms
 
-__all__ = ["EvaluateConfig", "Evaluation", "evaluate"]
+__all__ = ["Episode", "EvaluateConfig", "Evaluation", "evaluate", "write_evaluation"]
 
-_UNLIMITED_US = 1e9
-_CHUNK = 16  # episodes that one worker plays at once, as one batch of bots
+_EPISODES_A_BOT = 4  # in a group: enough that most frames have all places taken
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Which bundle plays what, how often."""
+    """Which bundle plays what, how often, under which budgets. Budgets are shares of the full cost."""
 
     bundle: tyro.conf.Positional[Path]
     environment: str = ""  # gymnasium id (empty: the one that the bundle names)
     episodes: int = 256
     seed: int = 1_000_000  # first episode's seed; the others follow it, none of them in the shipped traces
-    budget: float | None = None  # hard cap of a bot's query as a share of the full cost (None: the bundle's)
+    target_cost: float | None = None  # C asked of a budget-conditioned bundle (None: the bundle's)
+    budget: float | None = None  # hard cap of a bot's query; 1 is none (None: the bundle's, or 1 with a frame budget)
+    frame_budget: float | None = None  # hard cap that all bots alive in a frame share, of their full cost (None: none)
+    bots: int = 32  # most bots at once, as one batch
     workers: int = os.cpu_count() or 1
     out: Path | None = None  # where evaluation.json goes (None: into the bundle's folder)
+    heat_map: Path | None = None  # where the acquisition heat map goes (None: nowhere)
 
     def __post_init__(self) -> None:
-        if min(self.episodes, self.workers) < 1:
-            raise ValueError(f"episodes is {self.episodes} and workers {self.workers}, expected 1 or more of each")
-        if self.budget is not None and not 0.0 <= self.budget <= 1.0:
-            raise ValueError(f"budget is {self.budget}, expected a share of the full cost in [0, 1]")
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One episode's outcome. Costs are shares of the full cost, averaged over the episode's frames."""
-
-    seed: int
-    total: float  # return
-    frames: int
-    soft_cost: float  # what the network asks for on average, before allocation
-    hard_cost: float  # what it was allowed to acquire
-    violations: int  # frames whose cost passed the budget
-    terminated: bool
+        for name in ("episodes", "workers", "bots"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 1 or more")
+        for name in ("target_cost", "budget", "frame_budget"):
+            share = getattr(self, name)
+            if share is not None and not 0.0 <= share <= 1.0:
+                raise ValueError(f"{name} is {share}, expected a share of the full cost in [0, 1]")
 
 
 @dataclass(frozen=True)
@@ -71,130 +64,123 @@ class Evaluation:
     environment: str
     episodes: int
     seed: int
-    budget: float
+    budget: float  # hard cap of one bot; 1 is none
     return_mean: float
     return_std: float  # over episodes
     return_stderr: float
     soft_cost_pct: float
     hard_cost_pct: float
-    violations: int
+    violations: int  # frames in which a bot passed its own budget, or all together the one that they share
     frames_mean: float
     terminated_pct: float
+    method: str
+    acquisition: str  # learned, random, all or none
+    dataset: str  # folder that it was trained on, such as hard-expert-v0
+    trained_budget: float | None  # C that it was trained for (None: one network for every budget)
+    train_seed: int | None
+    target_cost: float | None  # C asked of the network (None: not conditioned)
+    frame_budget: float | None  # shared by all bots alive in a frame (None: none)
+    bots: int
 
 
-class _Player:
-    """One worker's runtime: plays a few episodes at once as one batch of bots."""
+def evaluate(config: EvaluateConfig) -> tuple[Evaluation, list[Episode]]:
+    """Play `episodes` episodes in parallel processes, and write the heat map if one is asked for.
 
-    def __init__(self, config: EvaluateConfig, environment: str) -> None:
-        self._bundle = Bundle.load(config.bundle, replay=False)
-        self._costs = CostModel.declared(self._bundle.manifest.features)
-        budget = self._bundle.manifest.budget if config.budget is None else config.budget
-        self._budget_us = _UNLIMITED_US if budget == 1.0 else budget * self._costs.full_us
-        self._environment = environment
-        self._environments: list[gymnasium.Env] = []
-
-    def play(self, seeds: list[int]) -> list[Episode]:
-        """Play one episode a seed."""
-        while len(self._environments) < len(seeds):
-            self._environments.append(gymnasium.make(self._environment))
-        bots = Bots(self._bundle, max_bots=len(seeds))
-        handles = bots.start(len(seeds), seeds=seeds, budgets_us=[self._budget_us] * len(seeds))
-        observations = [env.reset(seed=seed)[0] for env, seed in zip(self._environments, seeds, strict=False)]
-        games = [
-            _Game(i, seed, observation) for i, (seed, observation) in enumerate(zip(seeds, observations, strict=True))
-        ]
-        live, frame = list(games), 0
-        while live:
-            self._turn(bots, handles[[game.index for game in live]], frame, live)
-            live, frame = [game for game in live if not game.over], frame + 1
-        return [game.episode() for game in games]
-
-    def _turn(self, bots: Bots, handles: NDArray[np.int64], frame: int, live: list[_Game]) -> None:
-        free = np.stack([game.observation["free"] for game in live])
-        costly = np.stack([game.observation["costly"] for game in live])
-        rewards = np.array([game.reward for game in live], dtype=np.float32)
-        queries = bots.request_queries(handles, frame, free, rewards)
-        asked = queries.query_NM[:, self._bundle.manifest.features.owner]
-        actions = bots.submit_features(handles, frame, queries.query_NM, np.where(asked, costly, np.float32(0.0)))
-        soft = np.nan_to_num(queries.probs_NM) @ self._costs.costs_us / self._costs.full_us
-        hard = self._costs.query_cost_us(queries.query_NM)
-        for i, game in enumerate(live):
-            game.soft += float(soft[i])
-            game.hard += float(hard[i]) / self._costs.full_us
-            game.violations += int(hard[i] > self._budget_us)
-            game.step(self._environments[game.index], actions.action_NA[i])
+    The outcome depends neither on `workers` nor, without a frame budget, on `bots`. Raises BadBundle for a bundle that
+    does not verify, ValueError for a target cost that it cannot be asked for.
+    """
+    bundle = Bundle.load(config.bundle)
+    terms = _terms(config, bundle.manifest)
+    groups = _play_all(config, terms, bundle.name)
+    episodes = sorted((episode for group in groups for episode in group.episodes), key=lambda episode: episode.seed)
+    if config.heat_map is not None:
+        _write_heat_map(config.heat_map, groups, bundle.manifest)
+    violations = sum(group.violations for group in groups)
+    return _summary(config, terms, bundle.manifest, episodes, violations), episodes
 
 
-class _Game:
-    """One episode under way."""
-
-    def __init__(self, index: int, seed: int, observation: dict[str, NDArray[np.float32]]) -> None:
-        self.index, self.seed, self.observation = index, seed, observation
-        self.reward = self.total = self.soft = self.hard = 0.0
-        self.frames = self.violations = 0
-        self.over = self.terminated = False
-
-    def step(self, env: gymnasium.Env, action: NDArray[np.float32]) -> None:
-        self.observation, reward, self.terminated, truncated, _ = env.step(action)
-        self.reward = float(reward)
-        self.total += self.reward
-        self.frames += 1
-        self.over = bool(self.terminated or truncated)
-
-    def episode(self) -> Episode:
-        soft, hard = self.soft / self.frames, self.hard / self.frames
-        return Episode(self.seed, self.total, self.frames, soft, hard, self.violations, bool(self.terminated))
+def write_evaluation(path: Path, evaluation: Evaluation, episodes: list[Episode]) -> None:
+    """Write one line of JSON: the evaluation, and the return of each episode."""
+    data = {**asdict(evaluation), "returns": [round(episode.total, 3) for episode in episodes]}
+    path.write_bytes(msgspec.json.encode(data) + b"\n")
 
 
-_player: _Player | None = None
+def _terms(config: EvaluateConfig, manifest: Manifest) -> Terms:
+    environment = config.environment or manifest.provenance.get("environment", "")
+    if not environment:
+        raise ValueError(f"{config.bundle} names no environment: give one with --environment")
+    target_cost = config.target_cost
+    if manifest.target_cost is None and target_cost is not None:
+        raise ValueError(f"target_cost is {target_cost}, expected none: {manifest.name} is not conditioned on a budget")
+    if target_cost is None:
+        target_cost = manifest.target_cost
+    budget = config.budget
+    if budget is None:
+        budget = manifest.budget if config.frame_budget is None else 1.0
+    with_heat_map = config.heat_map is not None
+    return Terms(config.bundle, environment, config.bots, budget, config.frame_budget, target_cost, with_heat_map)
 
 
-def _start_worker(config: EvaluateConfig, environment: str) -> None:
+_player: Player | None = None
+
+
+def _start_worker(terms: Terms) -> None:
     global _player
-    _player = _Player(config, environment)
+    _player = Player(terms)
 
 
-def _play(seeds: list[int]) -> list[Episode]:
+def _play(seeds: list[int]) -> Group:
     if _player is None:
         raise RuntimeError("a worker plays only after it was started")
     return _player.play(seeds)
 
 
-def evaluate(config: EvaluateConfig) -> tuple[Evaluation, list[Episode]]:
-    """Play `episodes` episodes in parallel processes. Raises BadBundle for a bundle that does not verify."""
-    manifest = Bundle.load(config.bundle).manifest
-    environment = config.environment or manifest.provenance.get("environment", "")
-    if not environment:
-        raise ValueError(f"{config.bundle} names no environment: give one with --environment")
-    seeds = list(range(config.seed, config.seed + config.episodes))
-    chunks = [seeds[i : i + _CHUNK] for i in range(0, len(seeds), _CHUNK)]
-    episodes: list[Episode] = []
+def _play_all(config: EvaluateConfig, terms: Terms, name: str) -> list[Group]:
+    """Every group, in order. Who plays with whom follows from `episodes` and `bots` alone."""
+    seeds = np.arange(config.seed, config.seed + config.episodes)
+    n_groups = math.ceil(config.episodes / (_EPISODES_A_BOT * config.bots))
+    parts: list[list[int]] = [part.tolist() for part in np.array_split(seeds, n_groups)]
     context = multiprocessing.get_context("spawn")
     with (
-        ProcessPoolExecutor(config.workers, context, _start_worker, (config, environment)) as pool,
+        ProcessPoolExecutor(min(config.workers, n_groups), context, _start_worker, (terms,)) as pool,
         Progress(console=Console(file=sys.stderr)) as progress,
     ):
-        task = progress.add_task(f"evaluating {manifest.name}", total=len(seeds))
-        for done in as_completed([pool.submit(_play, chunk) for chunk in chunks]):
-            episodes += done.result()
-            progress.update(task, completed=len(episodes))
-    episodes.sort(key=lambda episode: episode.seed)
+        task = progress.add_task(f"evaluating {name}", total=config.episodes)
+        futures = [pool.submit(_play, part) for part in parts]
+        for done in as_completed(futures):
+            progress.advance(task, len(done.result().episodes))
+        return [future.result() for future in futures]
+
+
+def _summary(
+    config: EvaluateConfig, terms: Terms, manifest: Manifest, episodes: list[Episode], shared_violations: int
+) -> Evaluation:
     returns = np.array([episode.total for episode in episodes])
+    origin = manifest.provenance
+    trained_budget = origin.get("trained_budget", "conditioned")
     return Evaluation(
         bundle=manifest.name,
-        environment=environment,
+        environment=terms.environment,
         episodes=len(episodes),
         seed=config.seed,
-        budget=manifest.budget if config.budget is None else config.budget,
+        budget=terms.budget,
         return_mean=float(returns.mean()),
         return_std=float(returns.std()),
         return_stderr=float(returns.std() / np.sqrt(len(returns))),
         soft_cost_pct=_frame_mean_pct(episodes, "soft_cost"),
         hard_cost_pct=_frame_mean_pct(episodes, "hard_cost"),
-        violations=sum(episode.violations for episode in episodes),
+        violations=shared_violations + sum(episode.violations for episode in episodes),
         frames_mean=float(np.mean([episode.frames for episode in episodes])),
         terminated_pct=100.0 * float(np.mean([episode.terminated for episode in episodes])),
-    ), episodes
+        method=manifest.method,
+        acquisition=origin.get("acquisition", ""),
+        dataset=origin.get("dataset", ""),
+        trained_budget=None if trained_budget == "conditioned" else float(trained_budget),
+        train_seed=int(origin["seed"]) if "seed" in origin else None,
+        target_cost=terms.target_cost,
+        frame_budget=terms.frame_budget,
+        bots=terms.bots,
+    )
 
 
 def _frame_mean_pct(episodes: list[Episode], name: str) -> float:
@@ -203,13 +189,20 @@ def _frame_mean_pct(episodes: list[Episode], name: str) -> float:
     return 100.0 * sum(getattr(episode, name) * episode.frames for episode in episodes) / frames
 
 
+def _write_heat_map(path: Path, groups: list[Group], manifest: Manifest) -> None:
+    total = HeatSums(manifest.features.n_queries)
+    for group in groups:
+        if group.heat is not None:
+            total.merge(group.heat)
+    features = manifest.features
+    total.mean(features.costs_us, tuple(feature.name for feature in features.costly)).write(path)
+
+
 def main() -> None:
     """Command line: prints one JSON line, and writes it with every episode."""
     config = tyro.cli(EvaluateConfig, description=__doc__)
     evaluation, episodes = evaluate(config)
-    out = config.out or config.bundle / "evaluation.json"
-    data = {**asdict(evaluation), "returns": [round(episode.total, 3) for episode in episodes]}
-    out.write_bytes(msgspec.json.encode(data) + b"\n")
+    write_evaluation(config.out or config.bundle / "evaluation.json", evaluation, episodes)
     print(msgspec.json.encode(asdict(evaluation)).decode())
 
 

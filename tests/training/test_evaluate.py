@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,9 @@ import pytest
 
 from game.env import ACTION_SPEC, feature_table
 from tests.bundles import make_bundle
+from tests.training.line import LINE
 from training.evaluate import EvaluateConfig, evaluate
+from training.heat_map import HeatMap
 
 ENVIRONMENT = "game.env:Navigation-hard-v0"
 
@@ -20,6 +23,11 @@ ENVIRONMENT = "game.env:Navigation-hard-v0"
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_bundle(tmp_path_factory.mktemp("bundles") / "random", features=feature_table(), action=ACTION_SPEC)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_bundle(tmp_path_factory.mktemp("bundles") / "tiny")
 
 
 def test_hard_cost_stays_within_the_budget_where_the_soft_one_does_not(bundle: Path) -> None:
@@ -31,12 +39,60 @@ def test_hard_cost_stays_within_the_budget_where_the_soft_one_does_not(bundle: P
     assert evaluation.return_mean == pytest.approx(sum(episode.total for episode in episodes) / 3)
 
 
-def test_outcome_depends_neither_on_workers_nor_on_batches(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = EvaluateConfig(bundle, ENVIRONMENT, episodes=4, budget=0.05, workers=1)
+def test_outcome_depends_neither_on_workers_nor_on_batches(bundle: Path) -> None:
+    config = EvaluateConfig(bundle, ENVIRONMENT, episodes=5, budget=0.05, workers=1)
     together = evaluate(config)[1]
-    monkeypatch.setattr("training.evaluate._CHUNK", 2)
-    apart = evaluate(dataclasses.replace(config, workers=2))[1]
+    apart = evaluate(dataclasses.replace(config, workers=2, bots=1))[1]
     assert [(e.seed, e.frames, e.total) for e in together] == [(e.seed, e.frames, e.total) for e in apart]
+
+
+def test_a_shared_budget_depends_on_who_plays_together_but_never_on_workers(tiny: Path, tmp_path: Path) -> None:
+    config = EvaluateConfig(tiny, LINE, episodes=20, frame_budget=0.1, bots=2, workers=1)
+    outcomes = []
+    for workers in (1, 2):
+        heat_map = tmp_path / f"{workers}.npz"
+        outcomes.append(evaluate(dataclasses.replace(config, workers=workers, heat_map=heat_map)))
+    assert outcomes[0] == outcomes[1]
+    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+    evaluation = outcomes[0][0]
+    assert (evaluation.budget, evaluation.frame_budget, evaluation.bots) == (1.0, 0.1, 2)
+    assert evaluation.violations == 0
+    assert evaluation.hard_cost_pct <= 10.0 < evaluation.soft_cost_pct
+    assert HeatMap.read(tmp_path / "1.npz").alive_T[0] == 20
+
+
+def test_says_what_was_trained_and_what_was_asked_for(tiny: Path) -> None:
+    evaluation, _ = evaluate(EvaluateConfig(tiny, LINE, episodes=2, workers=1))
+    assert (evaluation.method, evaluation.target_cost, evaluation.frame_budget) == ("bdt", None, None)
+    assert (evaluation.trained_budget, evaluation.train_seed, evaluation.budget) == (None, None, 0.5)
+
+
+def test_provenance_is_handed_on(tiny: Path, tmp_path: Path) -> None:
+    bundle = tmp_path / "bundle"
+    shutil.copytree(tiny, bundle)
+    manifest = json.loads((bundle / "manifest.json").read_text())
+    origin = {"environment": LINE, "dataset": "hard-expert-v0", "seed": "3", "trained_budget": "0.1"}
+    manifest["provenance"] = {**origin, "acquisition": "learned"}
+    (bundle / "manifest.json").write_text(json.dumps(manifest))
+    evaluation, _ = evaluate(EvaluateConfig(bundle, episodes=2, workers=1))
+    assert (evaluation.environment, evaluation.dataset, evaluation.acquisition) == (LINE, "hard-expert-v0", "learned")
+    assert (evaluation.train_seed, evaluation.trained_budget) == (3, 0.1)
+
+
+def test_a_conditioned_bundle_is_asked_for_its_own_target_cost_or_for_another(tmp_path: Path) -> None:
+    bundle = make_bundle(tmp_path / "conditioned", target_cost=0.25)
+    config = EvaluateConfig(bundle, LINE, episodes=4, budget=1.0, workers=1)
+    asked = {}
+    for target_cost in (None, 0.25, 0.9):
+        evaluation, _ = evaluate(dataclasses.replace(config, target_cost=target_cost))
+        asked[target_cost] = evaluation.soft_cost_pct
+        assert evaluation.target_cost == (target_cost or 0.25)
+    assert asked[None] == asked[0.25] != asked[0.9]
+
+
+def test_a_target_cost_is_refused_by_a_bundle_that_is_not_conditioned(tiny: Path) -> None:
+    with pytest.raises(ValueError, match=r"target_cost is 0.1, expected none: tiny is not conditioned"):
+        evaluate(EvaluateConfig(tiny, LINE, target_cost=0.1))
 
 
 def test_command_line_writes_what_it_prints(bundle: Path, tmp_path: Path) -> None:
@@ -55,7 +111,18 @@ def test_a_bundle_without_an_environment_needs_one(bundle: Path) -> None:
         evaluate(EvaluateConfig(bundle, episodes=1))
 
 
-@pytest.mark.parametrize("settings", [{"episodes": 0}, {"workers": 0}, {"budget": 1.5}, {"budget": float("nan")}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"episodes": 0},
+        {"workers": 0},
+        {"bots": 0},
+        {"budget": 1.5},
+        {"budget": float("nan")},
+        {"target_cost": -0.1},
+        {"frame_budget": 1.01},
+    ],
+)
 def test_refuses_settings_that_cannot_be(settings: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
         EvaluateConfig(Path("nowhere"), **settings)

@@ -1,0 +1,68 @@
+"""What evaluation sees of an environment: the same numbers, whether it pays for each or looks at all of them."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from game.env import feature_table
+from tests.bundles import FEATURES
+from tests.training.line import LINE, TIME_LIMIT, TIMED_LINE
+from training.environments import Environment, Paying, _Whole, open_environment
+
+NAVIGATION = "game.env:Navigation-hard-v0"
+
+
+def test_paying_for_each_ray_changes_nothing_that_is_seen() -> None:
+    owner_D = feature_table().owner
+    paid, whole = open_environment(NAVIGATION, owner_D), _Whole(gymnasium.make(NAVIGATION), owner_D)
+    assert not isinstance(paid, _Whole)
+    random = np.random.default_rng(0)
+    for env in (paid, whole):
+        env.restart(7)
+    for _ in range(60):
+        query_M = random.random(feature_table().n_queries) < 0.2
+        np.testing.assert_array_equal(paid.free(), whole.free())
+        np.testing.assert_array_equal(paid.acquire(query_M), whole.acquire(query_M))
+        action_A = np.array([random.uniform(-0.3, 0.3), 1.0, random.random()], dtype=np.float32)
+        outcome = paid.advance(action_A)
+        assert outcome == whole.advance(action_A)
+        if outcome.terminated:
+            for env in (paid, whole):
+                env.restart(8)
+
+
+def test_any_environment_hands_on_only_what_was_asked_for() -> None:
+    env: Environment = open_environment(LINE, FEATURES.owner)
+    env.restart(3)
+    nothing, all_of_it = np.zeros(FEATURES.n_queries, dtype=bool), np.ones(FEATURES.n_queries, dtype=bool)
+    assert not env.acquire(nothing).any()
+    assert (env.acquire(all_of_it) > 0.0).all()
+    first = all_of_it & (np.arange(FEATURES.n_queries) == 0)
+    np.testing.assert_array_equal(env.acquire(first) > 0.0, FEATURES.owner == 0)
+
+
+def test_a_time_limit_is_kept() -> None:
+    env = open_environment(TIMED_LINE, FEATURES.owner)
+    env.restart(3)
+    outcomes = [env.advance(np.zeros(3, dtype=np.float32)) for _ in range(TIME_LIMIT)]
+    assert [outcome.truncated for outcome in outcomes] == [False, True]
+
+
+def test_an_environment_that_pays_with_a_time_limit_is_played_through_its_wrapper() -> None:
+    if "Limited-navigation-v0" not in gymnasium.registry:
+        gymnasium.register("Limited-navigation-v0", "game.env:NavigationEnv", max_episode_steps=TIME_LIMIT)
+    env = open_environment("Limited-navigation-v0", feature_table().owner)
+    assert isinstance(gymnasium.make("Limited-navigation-v0").unwrapped, Paying)
+    env.restart(0)
+    for _ in range(TIME_LIMIT):
+        outcome = env.advance(np.zeros(3, dtype=np.float32))
+    assert outcome.truncated
+
+
+@pytest.mark.parametrize("name", ["free", "acquire", "restart", "advance"])
+def test_both_offer_the_same_calls(name: str) -> None:
+    for environment in (NAVIGATION, LINE):
+        owner_D = feature_table().owner if environment == NAVIGATION else FEATURES.owner
+        assert callable(getattr(open_environment(environment, owner_D), name))

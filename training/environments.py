@@ -1,0 +1,107 @@
+"""One environment as evaluation plays it: only what was asked for is looked at and, where possible, paid for.
+
+Any gymnasium environment whose observation is {"free": [F], "costly": [D]} will do. One that also offers the four
+calls of `Paying` acquires nothing but what is asked of it, which saves most of its time at a small budget. This module
+knows nothing about bundles, bots or budgets.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Environment", "Outcome", "Paying", "open_environment"]
+
+_Floats = NDArray[np.float32]
+_Bools = NDArray[np.bool_]
+
+
+class Outcome(NamedTuple):
+    """What one action led to."""
+
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+class Environment(Protocol):
+    """What evaluation needs of an environment."""
+
+    def restart(self, seed: int) -> None:
+        """Begin the episode of this seed."""
+
+    def free(self) -> _Floats:
+        """The free numbers of this moment, shape [F]."""
+
+    def acquire(self, query_M: _Bools) -> _Floats:
+        """The costly numbers asked for, shape [D], zero elsewhere."""
+
+    def advance(self, action_A: _Floats) -> Outcome:
+        """Play one action."""
+
+
+@runtime_checkable
+class Paying(Protocol):
+    """An environment whose features can be acquired one by one: `step` is `advance`, `observe_free` and `cast`."""
+
+    def restart(self, *, seed: int | None = None) -> dict[str, Any]:
+        """`reset` without acquiring anything."""
+
+    def observe_free(self) -> _Floats:
+        """The free numbers, shape [F]."""
+
+    def cast(self, query_M: _Bools) -> _Floats:
+        """The costly numbers asked for, shape [D], zero elsewhere."""
+
+    def advance(self, action: _Floats) -> tuple[float, bool, bool, dict[str, Any]]:
+        """`step` without acquiring anything."""
+
+
+def open_environment(name: str, owner_D: NDArray[np.int64]) -> Environment:
+    """Make the environment with this gymnasium id; `owner_D` says which costly feature each costly number is of."""
+    env = gymnasium.make(name)
+    bare = env.unwrapped
+    # A time limit is a wrapper's: going around it would play longer episodes.
+    if isinstance(bare, Paying) and env.spec is not None and env.spec.max_episode_steps is None:
+        return _Paid(bare)
+    return _Whole(env, owner_D)
+
+
+class _Paid:
+    """Acquires what is asked for and nothing else."""
+
+    def __init__(self, env: Paying) -> None:
+        self._env = env
+        self.free = env.observe_free
+        self.acquire = env.cast
+
+    def restart(self, seed: int) -> None:
+        self._env.restart(seed=seed)
+
+    def advance(self, action_A: _Floats) -> Outcome:
+        reward, terminated, truncated, _ = self._env.advance(action_A)
+        return Outcome(float(reward), bool(terminated), bool(truncated))
+
+
+class _Whole:
+    """Observes everything each step, and hands on what is asked for."""
+
+    def __init__(self, env: gymnasium.Env[dict[str, _Floats], _Floats], owner_D: NDArray[np.int64]) -> None:
+        self._env, self._owner_D = env, owner_D
+        self._observation: dict[str, _Floats] = {}
+
+    def restart(self, seed: int) -> None:
+        self._observation, _ = self._env.reset(seed=seed)
+
+    def free(self) -> _Floats:
+        return self._observation["free"]
+
+    def acquire(self, query_M: _Bools) -> _Floats:
+        return np.where(query_M[self._owner_D], self._observation["costly"], np.float32(0.0))
+
+    def advance(self, action_A: _Floats) -> Outcome:
+        self._observation, reward, terminated, truncated, _ = self._env.step(action_A)
+        return Outcome(float(reward), bool(terminated), bool(truncated))
