@@ -98,6 +98,18 @@ def bundle(bundle_path: Path) -> Bundle:
     return Bundle.load(bundle_path)
 
 
+@pytest.fixture(scope="session")
+def memoryless(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    """A bundle without a context."""
+    return Bundle.load(make_bundle(tmp_path_factory.mktemp("bundles") / "none", context_length=1, method="rcbc"))
+
+
+@pytest.fixture(scope="session")
+def conditioned(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    """A bundle that serves every budget; without one, it is asked for a quarter of the full cost and has no limit."""
+    return Bundle.load(make_bundle(tmp_path_factory.mktemp("bundles") / "any", target_cost=0.25, budget=1.0))
+
+
 @pytest.fixture
 def engine(bundle: Bundle) -> Engine:
     return Engine(Bots(bundle, max_bots=8))

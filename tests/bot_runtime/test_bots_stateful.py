@@ -216,6 +216,8 @@ class BotsMachine(RuleBasedStateMachine):
         assert self.bots.n_bots == len(self.reference.bots)
 
 
-def test_agrees_with_the_reference(bundle: Bundle) -> None:
-    steps = settings(max_examples=80, stateful_step_count=40, derandomize=True, deadline=None)
+@pytest.mark.parametrize(("kind", "examples"), [("bundle", 80), ("memoryless", 20)])
+def test_agrees_with_the_reference(kind: str, examples: int, request: pytest.FixtureRequest) -> None:
+    bundle = request.getfixturevalue(kind)
+    steps = settings(max_examples=examples, stateful_step_count=40, derandomize=True, deadline=None)
     run_state_machine_as_test(lambda: BotsMachine(bundle), settings=steps)

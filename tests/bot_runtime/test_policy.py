@@ -69,11 +69,21 @@ def test_rows_are_separate(bundle: Bundle) -> None:
         np.testing.assert_allclose(alone.new_keys[:, 0], together.new_keys[:, row], atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["hidden", "free", "returns_to_go"])
-def test_every_input_of_the_acquisition_graph_matters(bundle: Bundle, name: str) -> None:
-    policy, manifest = Policy(bundle), bundle.manifest
+@pytest.mark.parametrize("name", ["free_NF", "costly_ND", "query_NM", "returns_to_go_N", "noise_NA"])
+def test_every_input_of_a_memoryless_action_graph_matters(memoryless: Bundle, name: str) -> None:
+    policy, feed = Policy(memoryless), inputs(memoryless, 2)
+    before = act(policy, feed)
+    assert [array.size for array in before] == [2 * memoryless.manifest.action.size, 0, 0, 0]
+    assert before.finite_N.tolist() == [True, True]
+    changed = ~feed[name] if name == "query_NM" else feed[name] + 1
+    assert np.abs(act(policy, {**feed, name: changed}).action_NA - before.action_NA).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["hidden", "free", "returns_to_go", "target_cost"])
+def test_every_input_of_the_acquisition_graph_matters(conditioned: Bundle, name: str) -> None:
+    policy, manifest = Policy(conditioned), conditioned.manifest
     feed = [np.ones((1, manifest.width)), np.ones((1, manifest.features.n_free)), np.ones(1), np.zeros(1)]
     before = policy.query_probs(*feed)
-    feed[["hidden", "free", "returns_to_go"].index(name)] += 1.0
+    feed[["hidden", "free", "returns_to_go", "target_cost"].index(name)] += 1.0
     assert before.shape == (1, manifest.features.n_queries)
     assert np.abs(policy.query_probs(*feed) - before).max() > 1e-3
