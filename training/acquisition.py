@@ -3,13 +3,16 @@
 q_t depends on h_{t-1}, which depends on the queries before t. With the uniform noise u fixed, q = [u < q̃(q)] has one
 fixed point, because the system is causal: after p parallel passes the first p timesteps are final. `sample_queries`
 iterates to it; `sample_queries_incrementally` walks to it over a cache; `sample_queries_sequentially` is the paper's
-loop, kept as the reference.
+loop, kept as the reference. A network without memory, or whose queries are not learned, is at it after one pass.
+
+What was sampled may have to fit a budget before it is acquired: `Fit` is that step, the same in training as at run
+time, and as causal as the sampling.
 
 The gradient is causal too. With q a leaf of the graph, ∂L/∂q_t flows on through the straight-through estimator into
 q̃_t, hence into h_{t-1} and earlier queries. `backward` sweeps that adjoint backwards: after p sweeps, paths through
 at most p queries are complete; enough sweeps give the sequential loop's gradient exactly (a test).
 
-This module knows nothing about data or optimisers. Shape letters as in `training.models`.
+This module knows nothing about data or optimisers. Shape letters as in `training.policy`.
 """
 
 from __future__ import annotations
@@ -22,8 +25,10 @@ from torch import Tensor
 
 from training.models import BudgetedDecisionTransformer
 from training.objectives import straight_through
+from training.policy import BudgetedPolicy, Known
 
 __all__ = [
+    "Fit",
     "Rollout",
     "backward",
     "rollout",
@@ -31,6 +36,9 @@ __all__ = [
     "sample_queries_incrementally",
     "sample_queries_sequentially",
 ]
+
+Fit = Callable[[Tensor, Tensor], Tensor]
+"""(probs [B, M], sampled [B, M]) of one timestep -> the part of what was sampled that is acquired, [B, M]."""
 
 
 @dataclass(frozen=True)
@@ -42,78 +50,92 @@ class Rollout:
     hidden_BTW: Tensor
 
 
-def rollout(model: BudgetedDecisionTransformer, context: Tensor, costly: Tensor, query: Tensor) -> Rollout:
-    """Trunk and query probabilities for fixed queries: context [B, T, *], costly [B, T, D], query [B, T, M]."""
-    hidden = model.trunk(model.tokens(context, costly, query))
-    return Rollout(query, model.query_probs(model.shift(hidden), context), hidden)
+def rollout(model: BudgetedPolicy, known: Known, query_BTM: Tensor) -> Rollout:
+    """Hidden states and query probabilities for fixed queries."""
+    hidden = model.hiddens(known, query_BTM)
+    return Rollout(query_BTM, model.query_probs(model.memory(hidden), known), hidden)
+
+
+def _draw(probs: Tensor, uniforms: Tensor, fit: Fit | None) -> Tensor:
+    """The queries of timesteps whose probabilities are known, [B, T, M]."""
+    sampled = (uniforms < probs).to(probs.dtype)
+    if fit is None:
+        return sampled
+    return torch.stack([fit(probs[:, t], sampled[:, t]) for t in range(probs.shape[1])], dim=1)
 
 
 @torch.no_grad()
 def sample_queries(
-    model: BudgetedDecisionTransformer, context: Tensor, costly: Tensor, uniforms_BTM: Tensor
+    model: BudgetedPolicy, known: Known, uniforms_BTM: Tensor, fit: Fit | None = None
 ) -> tuple[Tensor, int]:
     """The queries that the sequential loop samples with the same noise, [B, T, M], and how many passes it took."""
     length = uniforms_BTM.shape[1]
-    if model.config.acquisition != "learned":
-        return torch.full_like(uniforms_BTM, float(model.config.acquisition == "all")), 0
     query = (uniforms_BTM < 0.5).to(uniforms_BTM.dtype)
-    open_B = torch.arange(len(query))  # sequences that are not at their fixed point yet
+    if model.config.acquisition != "learned" or not model.config.has_memory:
+        no_memory = uniforms_BTM.new_zeros(*uniforms_BTM.shape[:2], model.memory_width)
+        return _draw(model.query_probs(no_memory, known), uniforms_BTM, fit), 1
+    open_B = torch.arange(len(query), device=query.device)  # sequences that are not at their fixed point yet
     for passes in range(1, length + 1):
-        probs = rollout(model, context[open_B], costly[open_B], query[open_B]).probs_BTM
-        sampled = (uniforms_BTM[open_B] < probs).to(query.dtype)
+        probs = rollout(model, known.rows(open_B), query[open_B]).probs_BTM
+        sampled = _draw(probs, uniforms_BTM[open_B], fit)
         changed_B = (sampled != query[open_B]).flatten(1).any(1)
         query[open_B] = sampled
-        open_B = open_B[changed_B]
-        if len(open_B) == 0:
+        if fit is None:  # with a shared budget the sequences depend on each other
+            open_B = open_B[changed_B]
+        if not changed_B.any():
             return query, passes
     return query, length
 
 
 @torch.no_grad()
 def sample_queries_incrementally(
-    model: BudgetedDecisionTransformer, context: Tensor, costly: Tensor, uniforms_BTM: Tensor
+    model: BudgetedPolicy, known: Known, uniforms_BTM: Tensor, fit: Fit | None = None
 ) -> tuple[Tensor, int]:
     """The same queries, one timestep after another over cached keys and values: each token is computed once.
 
     Cheaper than parallel passes where a small batch keeps the processor busy (a CPU); the other way round on a GPU.
     """
+    if model.config.acquisition != "learned" or not isinstance(model, BudgetedDecisionTransformer):
+        return sample_queries(model, known, uniforms_BTM, fit)
     config, (batch, length, _) = model.config, uniforms_BTM.shape
-    if config.acquisition != "learned":
-        return torch.full_like(uniforms_BTM, float(config.acquisition == "all")), 0
     shape = (config.n_layers, batch, config.n_heads, length, config.width // config.n_heads)
-    keys, values = context.new_empty(shape), context.new_empty(shape)
-    hidden, query = context.new_zeros(batch, config.width), torch.empty_like(uniforms_BTM)
+    keys, values = uniforms_BTM.new_empty(shape), uniforms_BTM.new_empty(shape)
+    hidden, query = uniforms_BTM.new_zeros(batch, config.width), torch.empty_like(uniforms_BTM)
+    ages = torch.arange(length, 0, -1, device=query.device)[None]
     for t in range(length):
-        probs = model.query_probs(hidden, context[:, t])
-        query[:, t] = uniforms_BTM[:, t] < probs
-        x = model.tokens(context[:, t], costly[:, t], query[:, t])
+        now = known.at(t)
+        probs = model.query_probs(hidden, now)
+        sampled = (uniforms_BTM[:, t] < probs).to(query.dtype)
+        query[:, t] = sampled if fit is None else fit(probs, sampled)
+        x = model.tokens(now, query[:, t])
         span = slice(max(0, t - config.context_length + 1), t)
-        ages = torch.arange(span.stop - span.start, 0, -1)[None]
         for layer, block in enumerate(model.blocks):
-            x, key, value = block.step(x, keys[layer, :, :, span], values[layer, :, :, span], ages)
+            past = keys[layer, :, :, span], values[layer, :, :, span]
+            x, key, value = block.step(x, *past, ages[:, length - t + span.start :])
             keys[layer, :, :, t], values[layer, :, :, t] = key, value
         hidden = model.norm_out(x)
     return query, length
 
 
 def sample_queries_sequentially(
-    model: BudgetedDecisionTransformer, context: Tensor, costly: Tensor, uniforms_BTM: Tensor
+    model: BudgetedDecisionTransformer, known: Known, uniforms_BTM: Tensor, fit: Fit | None = None
 ) -> Rollout:
     """The paper's loop: one timestep after another, the whole history recomputed at each. Differentiable throughout."""
     batch, length, _ = uniforms_BTM.shape
-    hidden = context.new_zeros(batch, 1, model.config.width)
+    hidden = uniforms_BTM.new_zeros(batch, model.config.width)
     tokens: list[Tensor] = []
     queries, probs_all, hiddens = [], [], []
     for t in range(length):
-        now = slice(t, t + 1)
-        probs = model.query_probs(hidden, context[:, now])
-        query = straight_through((uniforms_BTM[:, now] < probs).to(probs.dtype), probs)
-        tokens.append(model.tokens(context[:, now], costly[:, now], query))
-        hidden = model.trunk(torch.cat(tokens, dim=1))[:, -1:]
+        now = known.at(t)
+        probs = model.query_probs(hidden, now)
+        sampled = (uniforms_BTM[:, t] < probs).to(probs.dtype)
+        query = straight_through(sampled if fit is None else fit(probs.detach(), sampled), probs)
+        tokens.append(model.tokens(now, query))
+        hidden = model.trunk(torch.stack(tokens, dim=1))[:, -1]
         queries.append(query)
         probs_all.append(probs)
         hiddens.append(hidden)
-    return Rollout(torch.cat(queries, 1), torch.cat(probs_all, 1), torch.cat(hiddens, 1))
+    return Rollout(torch.stack(queries, 1), torch.stack(probs_all, 1), torch.stack(hiddens, 1))
 
 
 def backward(sampled: Rollout, loss: Callable[[Rollout], Tensor], sweeps: int) -> Tensor:

@@ -15,8 +15,9 @@ import numpy as np
 import torch
 
 from protocol.features import ActionSpec, FeatureTable
+from training.build import make_policy
 from training.config import TrainConfig
-from training.models import BudgetedDecisionTransformer, ModelConfig
+from training.policy import BudgetedPolicy, ModelConfig
 from training.traces import Traces
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class Trained:
 
     config: TrainConfig
     facts: Facts
-    model: BudgetedDecisionTransformer
+    model: BudgetedPolicy
     done: int
 
 
@@ -77,9 +78,11 @@ def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainS
         "model": state.model.state_dict(),
         "optimiser": state.optimiser.state_dict(),
         "done": state.done,
-        "penalty_weight": state.penalty_weight,
+        "penalty_weights": state.control.weights,
         "seconds": state.seconds,
     }
+    if state.critics is not None and state.critic_optimiser is not None:
+        data |= {"critics": state.critics.state_dict(), "critic_optimiser": state.critic_optimiser.state_dict()}
     partial = path.with_suffix(".partial")
     torch.save(data, partial)
     os.replace(partial, path)
@@ -87,7 +90,7 @@ def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainS
 
 def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
     """Continue a run: its settings must be those it began with, but for how long it goes on. Raises ValueError."""
-    data = torch.load(path, weights_only=True)
+    data = torch.load(path, weights_only=True, map_location=config.device)
     theirs, ours = _decode_config(data["config"]), config
     for name, value in asdict(ours).items():
         if name not in ("out", "updates", "log_every", "checkpoint_every") and getattr(theirs, name) != value:
@@ -96,7 +99,11 @@ def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
             )
     state.model.load_state_dict(data["model"])
     state.optimiser.load_state_dict(data["optimiser"])
-    state.done, state.penalty_weight, state.seconds = data["done"], data["penalty_weight"], data["seconds"]
+    state.control.weights = list(data["penalty_weights"])
+    state.done, state.seconds = data["done"], data["seconds"]
+    if state.critics is not None and state.critic_optimiser is not None:
+        state.critics.load_state_dict(data["critics"])
+        state.critic_optimiser.load_state_dict(data["critic_optimiser"])
 
 
 def load_trained(path: Path) -> Trained:
@@ -105,8 +112,8 @@ def load_trained(path: Path) -> Trained:
         raise FileNotFoundError(
             f"{path} does not exist: training writes it every checkpoint_every updates, and at the end"
         )
-    data = torch.load(path, weights_only=True)
-    model = BudgetedDecisionTransformer(msgspec.json.decode(data["model_config"], type=ModelConfig))
+    data = torch.load(path, weights_only=True, map_location="cpu")
+    model = make_policy(msgspec.json.decode(data["model_config"], type=ModelConfig))
     model.load_state_dict(data["model"])
     model.eval()
     facts = Facts(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +13,7 @@ __all__ = ["TrainConfig"]
 
 
 _COUNTS = ("window", "width", "n_layers", "n_heads", "encoder_width", "batch", "updates", "warmup", "sweeps")
-_COUNTS += ("log_every", "checkpoint_every")
+_COUNTS += ("frame_bots", "log_every", "checkpoint_every")
 
 
 @dataclass(frozen=True)
@@ -27,9 +28,14 @@ class TrainConfig:
     episodes: int | None = None  # read only the first so many episodes (None: all)
     held_out: float = 0.04  # share of the episodes, the last ones, that only measure the loss
 
-    acquisition: Literal["learned", "all", "none"] = "learned"  # learn the queries, or force all or none
+    method: Literal["bdt", "rcbc", "bc", "iql"] = "bdt"
+    acquisition: Literal["learned", "random", "all", "none"] = "learned"  # learn the queries, draw them, or force them
     budget: float = 0.1  # C: most that a query may cost, as a share of the full cost (Eq. 1)
-    penalty_step: float = 0.001  # ε: what γ rises by after a batch that violated the budget (Alg. 1)
+    budgets: tuple[float, ...] = ()  # C is an input, drawn for each window from the strata between these edges
+    control: Literal["algorithm-1", "dual"] = "algorithm-1"  # how γ moves (training/control.py)
+    penalty_step: float = 0.001  # ε: what γ rises by after a batch above C (Alg. 1); dual: most that log γ moves by
+    allocation: Literal["none", "bot", "frame"] = "none"  # what is sampled must fit C: each bot, or a frame's together
+    frame_bots: int = 20  # windows that share C where `allocation` is frame; batch is a multiple of it
     acquisition_bias: float = 0.0  # initial logit of every query probability
     sampler: Literal["incremental", "parallel"] = "incremental"  # same queries; incremental is faster on a CPU
     sweeps: int = 2  # backward sweeps of the query's adjoint (training/acquisition.py)
@@ -42,7 +48,7 @@ class TrainConfig:
     context_length: int = 20  # K
     window: int = 60  # timesteps in a training window
     width: int = 64  # W
-    n_layers: int = 2  # L
+    n_layers: int = 2  # L; hidden layers of width W where there is no memory
     n_heads: int = 4  # H
     encoder_width: int = 128  # hidden width of the token encoder and acquisition head
     fourier: int = 4  # octaves of each free number
@@ -54,6 +60,7 @@ class TrainConfig:
     weight_decay: float = 0.1
     gradient_clip: float = 1.0
 
+    device: str = "cpu"  # as torch names it
     log_every: int = 50  # updates between lines of metrics
     checkpoint_every: int = 500  # updates between checkpoints
 
@@ -70,6 +77,13 @@ class TrainConfig:
             raise ValueError(f"bins is {self.bins}, expected 2 or more for each action component")
         if self.width % self.n_heads:
             raise ValueError(f"width {self.width} is not a multiple of n_heads {self.n_heads}")
+        edges = self.budgets
+        if edges and (len(edges) < 2 or any(a >= b for a, b in pairwise(edges))):
+            raise ValueError(f"budgets is {edges}, expected two or more rising edges")
+        if edges and not 0.0 < edges[0] <= edges[-1] <= 1.0:
+            raise ValueError(f"budgets is {edges}, expected shares above 0 and at most 1")
+        if self.allocation == "frame" and self.batch % self.frame_bots:
+            raise ValueError(f"batch {self.batch} is not a multiple of frame_bots {self.frame_bots}")
         if self.context_length < 2:
             raise ValueError(f"context_length is {self.context_length}, expected 2 or more")
 

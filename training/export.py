@@ -26,9 +26,12 @@ from rich.console import Console
 from bot_runtime.bundle import Bundle
 from bot_runtime.manifest import FILES, SCHEMA_VERSION, FileEntry, Manifest
 from bot_runtime.noise import uniforms
+from training.acquisition import rollout, sample_queries
 from training.checkpoint import Trained, load_trained
 from training.curves import plot_curves
-from training.graphs import AcquisitionGraph, ActionGraph
+from training.graphs import AcquisitionGraph, ActionGraph, FrameActionGraph, example_inputs
+from training.models import BudgetedDecisionTransformer
+from training.policy import ModelConfig
 
 __all__ = ["ExportConfig", "export", "golden_episode", "write_graphs"]
 
@@ -46,38 +49,24 @@ class ExportConfig:
 
 def write_graphs(trained: Trained, folder: Path) -> None:
     """acquisition.onnx and action.onnx, with a dynamic number of bots N."""
-    model, config = trained.model, trained.model.config
-    n, slots, head = 2, config.context_length - 1, config.width // config.n_heads
-    free, togo = torch.zeros(n, config.n_free), torch.zeros(n, 1)
-    hidden = torch.zeros(n, config.width)
-    cache = torch.zeros(config.n_layers, n, config.n_heads, slots, head)
-    costly, query = torch.zeros(n, len(config.owner)), torch.zeros(n, config.n_queries)
-    noise, ages = torch.zeros(n, len(config.bins)), torch.full((n, slots), config.context_length)
-    bots = torch.export.Dim("N")
-    _write(
-        AcquisitionGraph(model),
-        {"hidden": hidden, "free": free, "returns_to_go": togo},
-        {name: {0: bots} for name in ("hidden", "free", "returns_to_go")},
-        ["query_probs"],
-        folder / "acquisition.onnx",
-    )
-    rows = {"free": free, "costly": costly, "query": query, "returns_to_go": togo, "noise": noise}
-    _write(
-        ActionGraph(model),
-        {**rows, "keys": cache, "values": cache.clone(), "ages": ages},
-        {**{name: {0: bots} for name in (*rows, "ages")}, "keys": {1: bots}, "values": {1: bots}},
-        ["action", "hidden", "new_keys", "new_values"],
-        folder / "action.onnx",
-    )
+    model = trained.model
+    before, now = example_inputs(model)
+    _write(AcquisitionGraph(model), before, ["query_probs"], folder / "acquisition.onnx")
+    if isinstance(model, BudgetedDecisionTransformer):
+        outputs = ["action", "hidden", "new_keys", "new_values"]
+        _write(ActionGraph(model), now, outputs, folder / "action.onnx")
+    else:
+        _write(FrameActionGraph(model), now, ["action"], folder / "action.onnx")
 
 
 def _write(
     graph: torch.nn.Module,
     inputs: dict[str, torch.Tensor],
-    dynamic: dict[str, dict[int, torch.export.Dim]],
     outputs: list[str],
     path: Path,
 ) -> None:
+    bots = torch.export.Dim("N")
+    dynamic = {name: {1 if name in ("keys", "values") else 0: bots} for name in inputs}
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         # The exporter warns of its own internals (deprecated calls, copied nodes): nothing that a user can act on.
@@ -114,24 +103,25 @@ def golden_episode(trained: Trained, seed: int = 0) -> dict[str, np.ndarray]:
     noise = uniforms(np.full(turns, seed, np.uint64), np.arange(turns), n_queries + len(model.config.bins))
     noise_BTn = torch.from_numpy(noise)[None]
     togo = facts.target_return - rewards.cumsum(0)
-    context = model.context(free[None], togo[None, :, None])
-    hidden, query = torch.zeros(1, 1, model.config.width), torch.zeros(1, turns, n_queries)
-    for t in range(turns):
-        probs = model.query_probs(hidden, context[:, t : t + 1])
-        query[:, t : t + 1] = (noise_BTn[:, t : t + 1, :n_queries] < probs).float()
-        hidden = model.trunk(model.tokens(context[:, : t + 1], costly[None, : t + 1], query[:, : t + 1]))[:, -1:]
-    hidden = model.trunk(model.tokens(context, costly[None], query))
-    return {
+    target_cost = torch.full((1, turns, 1), model.config.target_cost)
+    known = model.know(free[None], togo[None, :, None], target_cost, costly[None])
+    query, _ = sample_queries(model, known, noise_BTn[..., :n_queries])
+    played = rollout(model, known, query)
+    golden = {
         "seed": np.uint64(seed),
         "target_return": np.float32(facts.target_return),
         "free": free.numpy(),
         "costly": costly.numpy(),
         "rewards": rewards.numpy(),
-        "probs": model.query_probs(model.shift(hidden), context)[0].numpy(),
+        "probs": played.probs_BTM[0].numpy(),
         "queries": query[0].numpy().astype(np.uint8),
-        "actions": model.actions(hidden, noise_BTn[..., n_queries:])[0].numpy(),
-        "hidden": hidden[0].numpy(),
+        "actions": model.actions(played.hidden_BTW, noise_BTn[..., n_queries:])[0].numpy(),
     }
+    if model.config.has_memory:
+        golden["hidden"] = played.hidden_BTW[0].numpy()
+    if model.config.budget_conditioned:
+        golden["target_cost"] = np.float32(model.config.target_cost)
+    return golden
 
 
 def export(config: ExportConfig) -> Bundle:
@@ -164,15 +154,12 @@ def _manifest(trained: Trained, folder: Path, tolerance: float) -> Manifest:
     return Manifest(
         schema_version=SCHEMA_VERSION,
         name=config.name,
-        method="bdt",
+        method=config.method,
         features=facts.features,
         action=facts.action,
-        context_length=sizes.context_length,
-        n_layers=sizes.n_layers,
-        n_heads=sizes.n_heads,
-        head_dim=sizes.width // sizes.n_heads,
-        width=sizes.width,
         target_return=facts.target_return,
+        target_cost=sizes.target_cost if sizes.budget_conditioned else None,
+        **_context_sizes(sizes),
         budget=config.frame_budget,
         tolerance=tolerance,
         files=files,
@@ -182,9 +169,18 @@ def _manifest(trained: Trained, folder: Path, tolerance: float) -> Manifest:
             "seed": str(config.seed),
             "updates": str(trained.done),
             "acquisition": config.acquisition,
-            "trained_budget": str(config.budget),
+            "trained_budget": "conditioned" if config.budgets else str(config.budget),
         },
     )
+
+
+def _context_sizes(sizes: ModelConfig) -> dict[str, int]:
+    if not sizes.has_memory:
+        return {"context_length": 1, "n_layers": 0, "n_heads": 0, "head_dim": 0, "width": 0}
+    head_dim = sizes.width // sizes.n_heads
+    return {name: getattr(sizes, name) for name in ("context_length", "n_layers", "n_heads", "width")} | {
+        "head_dim": head_dim
+    }
 
 
 def main() -> None:

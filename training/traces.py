@@ -47,6 +47,11 @@ class Traces:
         """Return of each episode, shape [E]."""
         return self.returns_to_go_S.numpy()[self.starts_E]
 
+    def to(self, device: str) -> Traces:
+        """The same traces with their numbers on `device`."""
+        names = ("free_SF", "costly_SD", "actions_SA", "returns_to_go_S")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+
     def split(self, share: float) -> tuple[Traces, Traces]:
         """All but the last `share` of the episodes, and those: what is trained on, and what is held out."""
         first = len(self.lengths_E) - round(share * len(self.lengths_E))
@@ -64,6 +69,7 @@ class Batch:
     costly_BTD: Tensor
     actions_BTA: Tensor
     returns_to_go_BT1: Tensor
+    last_BT: Tensor  # 1 at an episode's last timestep
     valid_BT: Tensor
 
 
@@ -125,13 +131,16 @@ def draw_windows(traces: Traces, batch: int, length: int, generator: np.random.G
     start_B = start_B.clip(0, np.maximum(length_B - length, 0))
     step_BT = start_B[:, None] + np.arange(length)
     valid_BT = step_BT < length_B[:, None]
+    device = traces.free_SF.device
     index_BT = torch.from_numpy(traces.starts_E[episode_B][:, None] + np.minimum(step_BT, length_B[:, None] - 1))
+    index_BT = index_BT.to(device)
     return Batch(
         traces.free_SF[index_BT],
         traces.costly_SD[index_BT].float(),
         traces.actions_SA[index_BT],
         traces.returns_to_go_S[index_BT][..., None],
-        torch.from_numpy(valid_BT.astype(np.float32)),
+        torch.from_numpy((step_BT == length_B[:, None] - 1).astype(np.float32)).to(device),
+        torch.from_numpy(valid_BT.astype(np.float32)).to(device),
     )
 
 

@@ -1,82 +1,76 @@
 """Algorithm 1, from traces to a checkpoint: `python -m training.train --config training/configs/hard.json`.
 
-Reads top to bottom: configuration, traces, network, loop. Every update samples the queries that the paper's sequential
-loop would sample, takes one pass with gradients, and raises γ if the batch violated the budget. The run's folder holds
-what is needed to repeat it (config.json, versions.json), to go on with it (checkpoint.pt) and to judge it
+Reads top to bottom: state, batch, update, loop. Every update samples the queries that the paper's sequential loop would
+sample, takes one pass with gradients, and moves γ by what the batch spent; the method is what differs in Δ. The run's
+folder holds what is needed to repeat it (config.json, versions.json), to go on with it (checkpoint.pt) and to judge it
 (metrics.jsonl, TensorBoard).
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
-import json
 import math
-import platform
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 import torch
 import tyro
-from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from torch.utils.tensorboard import SummaryWriter
+from torch import Tensor
 
-from training.acquisition import Rollout, backward, rollout, sample_queries, sample_queries_incrementally
-from training.checkpoint import Facts, load_checkpoint, save_checkpoint
+from training.acquisition import Fit, Rollout, backward, rollout, sample_queries, sample_queries_incrementally
+from training.allocation import fit_bots, fit_frames
+from training.build import build_critics, build_model
+from training.checkpoint import Facts, load_checkpoint
 from training.config import TrainConfig
-from training.models import BudgetedDecisionTransformer, ModelConfig
-from training.objectives import action_loss, nearest_bins, penalty, penalty_weight, query_cost
-from training.traces import Batch, Traces, draw_windows, load_traces, moments
+from training.control import Control, draw_costs
+from training.iql import Critics
+from training.objectives import action_loss, nearest_bins, query_cost
+from training.policy import BudgetedPolicy, Known
+from training.record import RunRecord, write_versions
+from training.traces import Batch, Traces, draw_windows, load_traces
 
-__all__ = ["TrainState", "build_model", "main", "train", "update"]
+__all__ = ["TrainState", "main", "new_state", "train", "update"]
+
+_CRITIC_RATE = 3e-4
 
 
 @dataclass
 class TrainState:
     """All that changes while training."""
 
-    model: BudgetedDecisionTransformer
+    model: BudgetedPolicy
     optimiser: torch.optim.AdamW
+    control: Control  # γ
+    critics: Critics | None = None  # IQL's
+    critic_optimiser: torch.optim.Adam | None = None
     done: int = 0  # updates made
-    penalty_weight: float = 0.0  # γ
     seconds: float = 0.0  # spent training, resumed runs included
     metrics: dict[str, float] = field(default_factory=dict)
 
 
-def build_model(config: TrainConfig, traces: Traces) -> BudgetedDecisionTransformer:
-    """A network for these traces, normalised by them. Raises ValueError where the action layout is another."""
-    components = traces.action.components
-    if len(config.bins) != len(components):
-        raise ValueError(f"bins has {len(config.bins)} numbers, the action has {len(components)} components")
-    names = [component.name for component in components]
-    if unknown := set(config.sampled) - set(names):
-        raise ValueError(f"sampled names {sorted(unknown)}, the action has {names}")
-    model = BudgetedDecisionTransformer(
-        ModelConfig(
-            n_free=traces.features.n_free,
-            owner=tuple(int(i) for i in traces.features.owner),
-            n_queries=traces.features.n_queries,
-            bins=config.bins,
-            low=tuple(component.low for component in components),
-            high=tuple(component.high for component in components),
-            sampled=tuple(component.name in config.sampled for component in components),
-            context_length=config.context_length,
-            width=config.width,
-            n_layers=config.n_layers,
-            n_heads=config.n_heads,
-            encoder_width=config.encoder_width,
-            fourier=config.fourier,
-            acquisition=config.acquisition,
-            acquisition_bias=config.acquisition_bias,
-        )
-    )
-    model.normalise_free.fit(*moments(traces.free_SF))
-    model.normalise_costly.fit(*moments(traces.costly_SD))
-    model.normalise_return.fit(*moments(traces.returns_to_go_S[:, None]))
-    return model
+@dataclass(frozen=True)
+class Drawn:
+    """A batch, and what chance gave it."""
+
+    batch: Batch
+    target_B: Tensor  # C of each window
+    stratum_B: Tensor  # and which γ it has
+    uniforms_BTM: Tensor
+
+
+def new_state(config: TrainConfig, traces: Traces) -> TrainState:
+    """A run before its first update. Raises ValueError where settings and traces do not fit."""
+    torch.manual_seed(config.seed)
+    model = build_model(config, traces)
+    critics = build_critics(model)
+    model.to(config.device)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    control = Control.of(config.control, config.penalty_step, max(len(config.budgets) - 1, 1))
+    if critics is None:
+        return TrainState(model, optimiser, control)
+    critics.to(config.device)
+    return TrainState(model, optimiser, control, critics, torch.optim.Adam(critics.parameters(), lr=_CRITIC_RATE))
 
 
 def learning_rate(config: TrainConfig, done: int) -> float:
@@ -85,151 +79,146 @@ def learning_rate(config: TrainConfig, done: int) -> float:
     return config.learning_rate * warm * 0.5 * (1.0 + math.cos(math.pi * done / config.updates))
 
 
-def draw(
-    config: TrainConfig, model: BudgetedDecisionTransformer, traces: Traces, chance: np.random.Generator
-) -> tuple[Batch, torch.Tensor, float]:
-    """A batch, the queries that the network samples along it, [B, T, M], and how many passes or steps those took."""
+def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator) -> Drawn:
+    """Windows, their target costs and the noise of their queries."""
     batch = draw_windows(traces, config.batch, config.window, chance)
-    shape = (*batch.valid_BT.shape, model.config.n_queries)
-    uniforms_BTM = torch.from_numpy(chance.random(shape, dtype=np.float32))
-    with torch.no_grad():
-        context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
-    sample = sample_queries if config.sampler == "parallel" else sample_queries_incrementally
-    return batch, *sample(model, context, batch.costly_BTD, uniforms_BTM)
+    shape = (*batch.valid_BT.shape, traces.features.n_queries)
+    uniforms = torch.from_numpy(chance.random(shape, dtype=np.float32)).to(config.device)
+    together = config.frame_bots if config.allocation == "frame" else 1
+    targets, strata = np.full(config.batch, config.budget, np.float32), np.zeros(config.batch, np.int64)
+    if config.budgets:
+        drawn = draw_costs(config.budgets, config.batch // together, chance)
+        targets, strata = (part.repeat(together) for part in drawn)
+    device = config.device
+    return Drawn(batch, torch.from_numpy(targets).to(device), torch.from_numpy(strata).to(device), uniforms)
 
 
-def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: torch.Tensor) -> None:
+def know(model: BudgetedPolicy, drawn: Drawn) -> Known:
+    """All that the batch tells before its queries."""
+    batch = drawn.batch
+    target_BT1 = drawn.target_B[:, None, None].expand_as(batch.returns_to_go_BT1)
+    return model.know(batch.free_BTF, batch.returns_to_go_BT1, target_BT1, batch.costly_BTD)
+
+
+def sample(config: TrainConfig, model: BudgetedPolicy, known: Known, drawn: Drawn, costs_M: Tensor) -> tuple:
+    """The queries along the batch, [B, T, M], and how many passes or steps they took."""
+    fit: Fit | None = None
+    if config.allocation == "bot":
+        fit = fit_bots(costs_M, drawn.target_B)
+    elif config.allocation == "frame":
+        fit = fit_frames(costs_M, drawn.target_B, config.frame_bots)
+    sampler = sample_queries if config.sampler == "parallel" else sample_queries_incrementally
+    return sampler(model, known, drawn.uniforms_BTM, fit)
+
+
+def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tensor) -> None:
     """One iteration of Algorithm 1's loop. Its chance depends on the seed and its number alone, so that a resumed run
     is the run that was stopped."""
-    model = state.model
-    batch, query_BTM, passes = draw(config, model, traces, np.random.default_rng([config.seed, state.done]))
+    model, control = state.model, state.control
+    drawn = draw(config, traces, np.random.default_rng([config.seed, state.done]))
+    batch, valid_BT = drawn.batch, drawn.batch.valid_BT
+    state.optimiser.zero_grad(set_to_none=True)
+    known = know(model, drawn)
+    query_BTM, passes = sample(config, model, known, drawn, costs_M)
+    weight_BT = _critics_update(state, batch)
     parts: dict[str, float] = {}
 
-    def loss(sampled: Rollout) -> torch.Tensor:
-        delta = _delta(model, sampled, batch)
-        cost_BT = query_cost(sampled.query_BTM, costs_M)
-        phi = penalty(cost_BT, config.budget, batch.valid_BT)
+    def loss(sampled: Rollout) -> Tensor:
+        delta = _delta(model, sampled, batch, weight_BT)
+        penalised, phi = control.penalty(
+            query_cost(sampled.query_BTM, costs_M), drawn.target_B, drawn.stratum_B, valid_BT
+        )
         parts.update(delta=delta.item(), phi=phi.item())
-        parts["cost"] = ((cost_BT * batch.valid_BT).sum() / batch.valid_BT.sum()).item()
         # γφ depends on the queries alone, so it moves the acquisition path and leaves the action head as it is.
-        return delta + state.penalty_weight * phi
+        return delta + penalised
 
-    state.optimiser.zero_grad(set_to_none=True)
-    context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
-    backward(rollout(model, context, batch.costly_BTD, query_BTM.requires_grad_()), loss, config.sweeps)
+    sampled = rollout(model, known, query_BTM.requires_grad_())
+    backward(sampled, loss, config.sweeps if model.config.has_memory else 1)
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, state.done)
     state.optimiser.step()
+    # What is asked for, and not what allocation left of it: the network must learn to ask for what it may have.
+    asked_BT = query_cost((drawn.uniforms_BTM < sampled.probs_BTM).to(costs_M.dtype), costs_M).detach()
     if config.acquisition == "learned":
-        state.penalty_weight = penalty_weight(state.penalty_weight, parts["phi"], config.penalty_step)
+        control.observe(asked_BT, drawn.target_B, drawn.stratum_B, valid_BT)
     state.done += 1
-    state.metrics = {**parts, "gamma": state.penalty_weight, "passes": float(passes), "gradient_norm": float(norm)}
+    spent = _spent(config, asked_BT, drawn) | {"passes": float(passes), "gradient_norm": float(norm)}
+    state.metrics = parts | spent | _weights(control)
+
+
+def _critics_update(state: TrainState, batch: Batch) -> Tensor | None:
+    """One step of IQL's critics; the weight of each timestep's action, [B, T]."""
+    if state.critics is None or state.critic_optimiser is None:
+        return None
+    model, critics = state.model, state.critics
+    with torch.no_grad():
+        context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
+        everything = torch.cat([context, model.normalise_costly(batch.costly_BTD)], dim=-1)
+    togo_BT = batch.returns_to_go_BT1[..., 0]
+    state.critic_optimiser.zero_grad(set_to_none=True)
+    critics.loss(everything, batch.actions_BTA, togo_BT, batch.last_BT, batch.valid_BT).backward()
+    state.critic_optimiser.step()
+    critics.follow()
+    return critics.weights(everything, batch.actions_BTA)
 
 
 @torch.no_grad()
-def held_out_loss(config: TrainConfig, model: BudgetedDecisionTransformer, traces: Traces) -> float:
+def held_out_loss(config: TrainConfig, model: BudgetedPolicy, traces: Traces, costs_M: Tensor) -> float:
     """Δ on episodes that are not trained on; the same windows and the same noise every time."""
-    batch, query_BTM, _ = draw(config, model, traces, np.random.default_rng(config.seed))
-    context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
-    return _delta(model, rollout(model, context, batch.costly_BTD, query_BTM), batch).item()
+    drawn = draw(config, traces, np.random.default_rng(config.seed))
+    known = know(model, drawn)
+    query_BTM, _ = sample(config, model, known, drawn, costs_M)
+    return _delta(model, rollout(model, known, query_BTM), drawn.batch, None).item()
 
 
-def _delta(model: BudgetedDecisionTransformer, sampled: Rollout, batch: Batch) -> torch.Tensor:
+def _delta(model: BudgetedPolicy, sampled: Rollout, batch: Batch, weight_BT: Tensor | None) -> Tensor:
     bins_BTA = nearest_bins(batch.actions_BTA, model.config.low, model.config.high, model.config.bins)
-    return action_loss(model.action_logits(sampled.hidden_BTW), bins_BTA, batch.valid_BT)
+    return action_loss(model.action_logits(sampled.hidden_BTW), bins_BTA, batch.valid_BT, weight_BT)
+
+
+def _spent(config: TrainConfig, cost_BT: Tensor, drawn: Drawn) -> dict[str, float]:
+    """Mean cost asked for; where C is an input, of each stratum as a share of its C as well."""
+    valid_BT = drawn.batch.valid_BT
+    means = {"cost": ((cost_BT * valid_BT).sum() / valid_BT.sum()).item()}
+    for i in range(len(config.budgets) - 1):
+        rows = drawn.stratum_B == i
+        if rows.any():
+            allowed = (drawn.target_B[rows, None] * valid_BT[rows]).sum()
+            means[f"spent_{i}"] = ((cost_BT[rows] * valid_BT[rows]).sum() / allowed).item()
+    return means
+
+
+def _weights(control: Control) -> dict[str, float]:
+    means = {"gamma": sum(control.weights) / len(control.weights)}
+    if len(control.weights) > 1:
+        means |= {f"gamma_{i}": weight for i, weight in enumerate(control.weights)}
+    return means
 
 
 def train(config: TrainConfig) -> TrainState:
     """Train to the end, from the run's checkpoint if there is one; returns the final state."""
     config.out.mkdir(parents=True, exist_ok=True)
-    torch.manual_seed(config.seed)
     traces = load_traces(config.dataset, episodes=config.episodes)
-    model = build_model(config, traces)
-    optimiser = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
-    state = TrainState(model, optimiser)
+    state = new_state(config, traces)
     facts = Facts.of(traces, config.target_return)
-    checkpoint = config.out / "checkpoint.pt"
-    if checkpoint.exists():
-        load_checkpoint(checkpoint, config, state)
+    if (config.out / "checkpoint.pt").exists():
+        load_checkpoint(config.out / "checkpoint.pt", config, state)
     config.write(config.out / "config.json")
-    _write_versions(config.out / "versions.json", traces)
-    costs_M = torch.tensor(traces.features.costs_us, dtype=torch.float32)
-    training, held_out = traces.split(config.held_out)
-    with _Run(config, state, checkpoint, facts, held_out) as run:
+    write_versions(config.out / "versions.json", traces)
+    costs_M = torch.tensor(traces.features.costs_us, dtype=torch.float32, device=config.device)
+    training, held_out = traces.to(config.device).split(config.held_out)
+
+    def measure() -> dict[str, float]:
+        if not len(held_out.lengths_E):
+            return {}
+        return {"held_out": held_out_loss(config, state.model, held_out, costs_M)}
+
+    with RunRecord(config, state, facts, measure) as run:
         while state.done < config.updates:
             update(config, state, training, costs_M)
             run.record()
     return state
-
-
-class _Run:
-    """The outside of a run: progress, metrics and checkpoints. An interrupted run goes on from its last checkpoint."""
-
-    def __init__(
-        self, config: TrainConfig, state: TrainState, checkpoint: Path, facts: Facts, held_out: Traces
-    ) -> None:
-        self._config, self._state, self._held_out = config, state, held_out
-        self._checkpoint, self._facts = checkpoint, facts
-        self._sums: dict[str, float] = {}
-        self._summed = 0  # updates in the sums: fewer than log_every in the first line after a resume
-        self._began = time.monotonic() - state.seconds
-        metrics = config.out / "metrics.jsonl"
-        if metrics.exists():  # lines that came after the checkpoint will come again
-            kept = [line for line in metrics.read_text().splitlines(True) if json.loads(line)["update"] <= state.done]
-            metrics.write_text("".join(kept))
-        self._lines = metrics.open("a")
-        self._board = SummaryWriter(str(config.out), purge_step=state.done + 1)
-        columns = (*Progress.get_default_columns()[:2], TimeElapsedColumn(), TimeRemainingColumn())
-        self._progress = Progress(*columns, TextColumn("{task.fields[now]}"))
-        self._task = self._progress.add_task(config.name, total=config.updates, completed=state.done, now="")
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-        self._board.close()
-        self._lines.close()
-
-    def record(self) -> None:
-        """Count the update that was just made."""
-        state, config = self._state, self._config
-        state.seconds = time.monotonic() - self._began
-        for key, value in state.metrics.items():
-            self._sums[key] = self._sums.get(key, 0.0) + value
-        self._summed += 1
-        self._progress.update(self._task, completed=state.done)
-        if state.done % config.log_every == 0:
-            means = {key: value / self._summed for key, value in self._sums.items()}
-            if len(self._held_out.lengths_E):
-                means["held_out"] = held_out_loss(config, state.model, self._held_out)
-            self._log(means)
-            self._sums.clear()
-            self._summed = 0
-        if state.done % config.checkpoint_every == 0 or state.done == config.updates:
-            save_checkpoint(self._checkpoint, config, self._facts, state)
-
-    def _log(self, means: dict[str, float]) -> None:
-        line = {"update": self._state.done, "seconds": round(self._state.seconds, 1), **means}
-        self._lines.write(json.dumps(line) + "\n")
-        self._lines.flush()
-        for key, value in means.items():
-            self._board.add_scalar(key, value, self._state.done)
-        now = " ".join(f"{key} {means[key]:.3g}" for key in ("delta", "held_out", "cost", "gamma") if key in means)
-        self._progress.update(self._task, now=now)
-
-
-def _write_versions(path: Path, traces: Traces) -> None:
-    versions = {name: importlib.metadata.version(name) for name in ("torch", "onnx", "onnxruntime", "numpy", "minari")}
-    versions |= {
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "threads": str(torch.get_num_threads()),
-    }
-    versions |= {"episodes": str(len(traces.lengths_E)), "steps": str(int(traces.lengths_E.sum()))}
-    path.write_text(json.dumps(versions, indent=2) + "\n")
 
 
 def main(arguments: list[str] | None = None) -> None:

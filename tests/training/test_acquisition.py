@@ -15,15 +15,17 @@ from training.acquisition import (
     sample_queries_incrementally,
     sample_queries_sequentially,
 )
-from training.models import BudgetedDecisionTransformer, ModelConfig
+from training.allocation import fit_bots, fit_frames
+from training.models import BudgetedDecisionTransformer
 from training.objectives import action_loss, penalty, query_cost
+from training.policy import Known, ModelConfig
 
 F, M = 3, 4
 OWNER = (0, 0, 1, 2, 3, 3)
 
 
 def network(
-    seed: int, *, context_length: int = 4, n_layers: int = 2, spread: float = 1.0
+    seed: int, *, context_length: int = 4, n_layers: int = 2, spread: float = 1.0, acquisition: str = "learned"
 ) -> BudgetedDecisionTransformer:
     """Random weights, with an acquisition head that depends strongly on the past."""
     torch.manual_seed(seed)
@@ -41,9 +43,12 @@ def network(
         n_heads=2,
         encoder_width=16,
         fourier=1,
+        acquisition=acquisition,
+        target_cost=0.3,
+        budget_conditioned=True,
     )
     model = BudgetedDecisionTransformer(config)
-    torch.nn.init.normal_(model.acquisition_head[-1].weight, std=spread)
+    torch.nn.init.normal_(model.acquisition_head.out.weight, std=spread)
     for block in model.blocks:
         torch.nn.init.normal_(block.attention.age_bias, std=1.0)
         torch.nn.init.normal_(block.attention.out.weight, std=0.5)
@@ -63,27 +68,60 @@ def batch(seed: int, size: int, length: int) -> tuple[torch.Tensor, ...]:
     )
 
 
-@settings(max_examples=25, deadline=None)
+def know(model: BudgetedDecisionTransformer, free: torch.Tensor, costly: torch.Tensor, togo: torch.Tensor) -> Known:
+    """A target cost of its own for every sequence."""
+    target = torch.linspace(0.05, 0.9, len(free))[:, None, None].expand_as(togo)
+    return model.know(free, togo, target, costly)
+
+
+COSTS = torch.tensor([1.0, 2.0, 1.0, 3.0])
+
+
+@settings(max_examples=40, deadline=None)
 @given(
-    st.integers(0, 10_000), st.integers(1, 12), st.integers(2, 6), st.integers(1, 3), st.sampled_from([0.1, 1.0, 5.0])
+    st.integers(0, 10_000),
+    st.integers(1, 12),
+    st.integers(2, 6),
+    st.integers(1, 3),
+    st.sampled_from([0.1, 1.0, 5.0]),
+    st.sampled_from(["none", "bot", "frame"]),
 )
-def test_same_noise_same_queries(seed: int, length: int, context_length: int, n_layers: int, spread: float) -> None:
+def test_same_noise_same_queries(
+    seed: int, length: int, context_length: int, n_layers: int, spread: float, allocation: str
+) -> None:
+    """The property that makes parallel training exact, with and without the runtime's allocation in the loop."""
     model = network(seed, context_length=context_length, n_layers=n_layers, spread=spread)
-    free, costly, togo, uniforms, _ = batch(seed, 3, length)
-    context = model.context(free, togo)
-    query, passes = sample_queries(model, context, costly, uniforms)
+    free, costly, togo, uniforms, _ = batch(seed, 4, length)
+    known = know(model, free, costly, togo)
+    targets = known.target_cost[:, 0, 0]
+    fit = {"none": None, "bot": fit_bots(COSTS, targets), "frame": fit_frames(COSTS, targets, 2)}[allocation]
+    query, passes = sample_queries(model, known, uniforms, fit)
     with torch.no_grad():
-        reference = sample_queries_sequentially(model, context, costly, uniforms)
+        reference = sample_queries_sequentially(model, known, uniforms, fit)
     assert torch.equal(query, reference.query_BTM.round())
     assert passes <= length
-    assert torch.equal(sample_queries_incrementally(model, context, costly, uniforms)[0], query)
-    assert torch.allclose(rollout(model, context, costly, query).hidden_BTW, reference.hidden_BTW, atol=1e-5)
+    assert torch.equal(sample_queries_incrementally(model, known, uniforms, fit)[0], query)
+    assert torch.allclose(rollout(model, known, query).hidden_BTW, reference.hidden_BTW, atol=1e-5)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 3))
+def test_what_is_sampled_fits_its_budget(seed: int, bots: int) -> None:
+    g = torch.Generator().manual_seed(seed)
+    probs, target = torch.rand(2 * bots, M, generator=g), torch.rand(2 * bots, generator=g)
+    sampled = (torch.rand(probs.shape, generator=g) < probs).float()
+    alone, together = fit_bots(COSTS, target)(probs, sampled), fit_frames(COSTS, target, bots)(probs, sampled)
+    assert ((alone <= sampled) & (together <= sampled)).all()
+    assert (query_cost(alone, COSTS) <= target + 1e-6).all()
+    spent, allowed = query_cost(together, COSTS).view(2, bots).sum(1), target.view(2, bots).sum(1)
+    assert (spent <= allowed + 1e-6).all()
+    fits = query_cost(sampled, COSTS).view(2, bots).sum(1) < allowed - 1e-5
+    assert (together.view(2, bots, M)[fits] == sampled.view(2, bots, M)[fits]).all(), "what fits is left as it is"
 
 
 def objective(model: BudgetedDecisionTransformer, bins: torch.Tensor, gamma: float):
     def loss(sampled: Rollout) -> torch.Tensor:
         valid = torch.ones(bins.shape[:2])
-        cost = query_cost(sampled.query_BTM, torch.tensor([1.0, 2.0, 1.0, 3.0]))
+        cost = query_cost(sampled.query_BTM, COSTS)
         return action_loss(model.action_logits(sampled.hidden_BTW), bins, valid) + gamma * penalty(cost, 0.2, valid)
 
     return loss
@@ -99,13 +137,13 @@ def test_enough_sweeps_give_the_sequential_gradient(seed: int) -> None:
     model = network(seed)
     free, costly, togo, uniforms, bins = batch(seed, 2, length)
     loss = objective(model, bins, gamma=0.7)
-    reference = sample_queries_sequentially(model, model.context(free, togo), costly, uniforms)
+    reference = sample_queries_sequentially(model, know(model, free, costly, togo), uniforms)
     value = loss(reference)
     value.backward()
     expected = gradients(model)
     model.zero_grad()
-    query, _ = sample_queries(model, model.context(free, togo), costly, uniforms)
-    sampled = rollout(model, model.context(free, togo), costly, query.requires_grad_())
+    query, _ = sample_queries(model, know(model, free, costly, togo), uniforms)
+    sampled = rollout(model, know(model, free, costly, togo), query.requires_grad_())
     assert backward(sampled, loss, sweeps=length).item() == pytest.approx(value.item(), rel=1e-5)
     for name, gradient in gradients(model).items():
         assert torch.allclose(gradient, expected[name], rtol=1e-3, atol=1e-5), name
@@ -117,28 +155,35 @@ def test_penalty_moves_the_acquisition_path_only() -> None:
 
     def run(gamma: float) -> dict[str, torch.Tensor]:
         model.zero_grad()
-        query, _ = sample_queries(model, model.context(free, togo), costly, uniforms)
-        context = model.context(free, togo)
-        backward(rollout(model, context, costly, query.requires_grad_()), objective(model, bins, gamma), sweeps=2)
+        query, _ = sample_queries(model, know(model, free, costly, togo), uniforms)
+        sampled = rollout(model, know(model, free, costly, togo), query.requires_grad_())
+        backward(sampled, objective(model, bins, gamma), sweeps=2)
         return gradients(model)
 
     without, with_penalty = run(0.0), run(5.0)
     assert torch.equal(without["action_head.weight"], with_penalty["action_head.weight"])
-    name = "acquisition_head.2.weight"
+    name = "acquisition_head.out.weight"
     assert without[name].abs().sum() > 0, "the action loss must reach the acquisition head through the estimator"
     assert not torch.allclose(without[name], with_penalty[name])
 
 
 @pytest.mark.parametrize(("acquisition", "value"), [("all", 1.0), ("none", 0.0)])
 def test_forced_acquisition(acquisition: str, value: float) -> None:
-    import dataclasses
-
-    model = network(0)
-    model.config = dataclasses.replace(model.config, acquisition=acquisition)
+    model = network(0, acquisition=acquisition)
     free, costly, togo, uniforms, bins = batch(0, 2, 6)
-    query, _ = sample_queries(model, model.context(free, togo), costly, uniforms)
+    known = know(model, free, costly, togo)
+    query, _ = sample_queries(model, known, uniforms)
     assert (query == value).all()
-    sampled = rollout(model, model.context(free, togo), costly, query.requires_grad_())
+    sampled = rollout(model, known, query.requires_grad_())
     assert (sampled.probs_BTM == value).all()
     backward(sampled, objective(model, bins, 0.0), sweeps=2)
     assert model.action_head.weight.grad is not None
+
+
+def test_random_acquisition_draws_every_feature_with_probability_c() -> None:
+    model = network(0, acquisition="random")
+    free, costly, togo, uniforms, _ = batch(0, 5, 400)
+    known = know(model, free, costly, togo)
+    query, _ = sample_queries_incrementally(model, known, uniforms)
+    assert torch.allclose(query.mean((1, 2)), known.target_cost[:, 0, 0], atol=0.04)
+    assert torch.equal(query, (uniforms < known.target_cost).float())

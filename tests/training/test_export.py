@@ -55,10 +55,11 @@ def test_served_bots_equal_torch_over_a_whole_episode(trained: tuple[Path, Train
         probs.append(asked.probs_NM)
     togo = torch.from_numpy(np.array([10.0, 20.0], np.float32) - rewards.cumsum(0)).T[..., None]
     with torch.no_grad():
-        context = model.context(torch.from_numpy(free).transpose(0, 1), togo)
         query = torch.from_numpy(np.array(queries)).transpose(0, 1).float()
-        hidden = model.trunk(model.tokens(context, torch.from_numpy(costly).transpose(0, 1), query))
-        expected = model.query_probs(model.shift(hidden), context).transpose(0, 1).numpy()
+        frames = (torch.from_numpy(free).transpose(0, 1), togo, torch.full_like(togo, 0.2))
+        known = model.know(*frames, torch.from_numpy(costly).transpose(0, 1))
+        hidden = model.hiddens(known, query)
+        expected = model.query_probs(model.memory(hidden), known).transpose(0, 1).numpy()
         expected_actions = model.actions(hidden, torch.zeros(n, turns, 2)).transpose(0, 1).numpy()
     assert np.abs(np.array(probs) - expected).max() <= 1e-4
     assert np.abs(np.array(actions) - expected_actions).max() <= 1e-4
@@ -103,3 +104,30 @@ def test_forced_acquisition_exports_too(dataset: Path, tmp_path: Path) -> None:
     bots = Bots(Bundle.load(tmp_path / "full"), max_bots=1)
     handles = bots.start(1)
     assert bots.request_queries(handles, 0, np.zeros((1, 2), np.float32)).query_NM.all()
+
+
+@pytest.mark.parametrize("method", ["bdt", "rcbc", "bc", "iql"])
+@pytest.mark.parametrize("acquisition", ["learned", "random"])
+def test_every_method_exports_to_a_bundle_that_verifies(
+    dataset: Path, tmp_path: Path, method: str, acquisition: str
+) -> None:
+    """`export` loads what it wrote with the runtime's loader, which replays the golden episode."""
+    settings = {"method": method, "acquisition": acquisition, "budgets": (0.05, 0.3, 1.0), "budget": 0.25}
+    train(toy.config(dataset, tmp_path / "run", updates=3, log_every=1, **settings))
+    manifest = export(ExportConfig(tmp_path / "run", tmp_path / "bundle")).manifest
+    assert (manifest.method, manifest.target_cost) == (method, 0.25)
+    assert manifest.context_length == (5 if method == "bdt" else 1)
+    assert manifest.provenance["trained_budget"] == "conditioned"
+
+
+def test_a_served_bot_follows_the_budget_that_the_engine_gives_in_each_frame(dataset: Path, tmp_path: Path) -> None:
+    """Random acquisition asks for each feature with probability C: what the graph was told can be read off."""
+    settings = {"acquisition": "random", "budgets": (0.05, 1.0), "frame_budget": 1.0, "updates": 2, "log_every": 1}
+    train(toy.config(dataset, tmp_path / "run", **settings))
+    export(ExportConfig(tmp_path / "run", tmp_path / "bundle"))
+    bots = Bots(Bundle.load(tmp_path / "bundle"), max_bots=1)
+    handles = bots.start(1)
+    full = float(toy.FEATURES.costs_us.sum())
+    for frame, share in enumerate((0.1, 0.7, 0.3)):
+        asked = bots.request_queries(handles, frame, np.zeros((1, 2), np.float32), target_costs_us=[share * full])
+        assert asked.probs_NM == pytest.approx(share, abs=1e-6)

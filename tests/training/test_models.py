@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.training.test_acquisition import M, batch, network
+from tests.training.test_acquisition import M, batch, know, network
 from training.graphs import AcquisitionGraph, ActionGraph
 from training.models import BudgetedDecisionTransformer
 
 
 def hidden_states(model: BudgetedDecisionTransformer, free, costly, togo, query) -> torch.Tensor:
-    return model.trunk(model.tokens(model.context(free, togo), costly, query))
+    return model.hiddens(know(model, free, costly, togo), query)
 
 
 def test_unacquired_values_never_matter() -> None:
@@ -30,9 +30,9 @@ def test_future_and_current_values_never_change_the_query() -> None:
     query = torch.ones(2, 9, M)
     changed = costly.clone()
     changed[:, 5:] += 10.0
-    context = model.context(free, togo)
-    before = model.query_probs(model.shift(hidden_states(model, free, costly, togo, query)), context)
-    after = model.query_probs(model.shift(hidden_states(model, free, changed, togo, query)), context)
+    known = know(model, free, costly, togo)
+    before = model.query_probs(model.memory(hidden_states(model, free, costly, togo, query)), known)
+    after = model.query_probs(model.memory(hidden_states(model, free, changed, togo, query)), known)
     assert torch.allclose(before[:, :6], after[:, :6])
     assert not torch.allclose(before[:, 6:], after[:, 6:])
 
@@ -60,7 +60,8 @@ def test_incremental_equals_windowed_over_an_episode_longer_than_the_span(seed: 
     free, costly, togo, uniforms, _ = batch(seed, n, length)
     query = (uniforms < 0.5).float()
     windowed = hidden_states(model, free, costly, togo, query)
-    probs = model.query_probs(model.shift(windowed), model.context(free, togo))
+    known = know(model, free, costly, togo)
+    probs = model.query_probs(model.memory(windowed), known)
     keys = torch.zeros(config.n_layers, n, config.n_heads, slots, head)
     values = torch.full_like(keys, 9.0)  # an empty slot's contents must not matter
     ages = torch.full((n, slots), config.context_length)
@@ -68,7 +69,8 @@ def test_incremental_equals_windowed_over_an_episode_longer_than_the_span(seed: 
     noise = torch.rand(n, length, 2)
     acquisition, action = AcquisitionGraph(model), ActionGraph(model)
     for t in range(length):
-        assert torch.allclose(acquisition(hidden, free[:, t], togo[:, t]), probs[:, t], atol=1e-5)
+        target = known.target_cost[:, t]
+        assert torch.allclose(acquisition(free[:, t], togo[:, t], hidden, target), probs[:, t], atol=1e-5)
         actions, hidden, new_keys, new_values = action(
             free[:, t], costly[:, t], query[:, t], togo[:, t], noise[:, t], keys, values, ages
         )
@@ -88,3 +90,14 @@ def test_sampled_component_follows_its_probabilities() -> None:
     expected = torch.softmax(model.action_logits(hidden)[1], -1)[0, 1].item()
     assert actions[:, 1].mean().item() == pytest.approx(expected, abs=2e-3)
     assert actions[:, 0].unique().numel() == 1
+
+
+def test_the_target_cost_moves_the_query_and_nothing_else() -> None:
+    model = network(4)
+    free, costly, togo, uniforms, _ = batch(4, 2, 6)
+    query = (uniforms < 0.5).float()
+    little, much = (model.know(free, togo, torch.full_like(togo, c), costly) for c in (0.01, 0.5))
+    hidden = model.hiddens(little, query)
+    assert torch.equal(hidden, model.hiddens(much, query))
+    memory = model.memory(hidden)
+    assert not torch.allclose(model.query_probs(memory, little), model.query_probs(memory, much), atol=1e-3)

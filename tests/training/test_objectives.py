@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from training.objectives import action_loss, nearest_bins, penalty, penalty_weight, query_cost, straight_through
+from training.objectives import action_loss, nearest_bins, penalty, query_cost, straight_through
 
 bits = st.lists(st.integers(0, 1), min_size=3, max_size=3)
 
@@ -59,13 +59,12 @@ def test_straight_through_is_the_sample_in_value_and_the_probability_in_gradient
     assert probs.grad.tolist() == [3.0, 5.0]
 
 
-@given(st.lists(st.floats(0, 1), max_size=30), st.floats(1e-4, 1))
-def test_penalty_weight_never_falls_and_counts_violations(phis: list[float], step: float) -> None:
-    weight = 0.0
-    for phi in phis:
-        before, weight = weight, penalty_weight(weight, phi, step)
-        assert weight == (before + step if phi > 0 else before)
-    assert weight == pytest.approx(step * sum(phi > 0 for phi in phis))
+def test_a_timestep_that_is_worth_more_counts_more() -> None:
+    torch.manual_seed(1)
+    logits, bins, valid = torch.randn(1, 3, 4), torch.randint(0, 4, (1, 3, 1)), torch.tensor([[1.0, 1.0, 0.0]])
+    each = [action_loss([logits[:, t : t + 1]], bins[:, t : t + 1], torch.ones(1, 1)).item() for t in range(2)]
+    weighted = action_loss([logits], bins, valid, torch.tensor([[3.0, 0.5, 100.0]]))
+    assert weighted.item() == pytest.approx((3.0 * each[0] + 0.5 * each[1]) / 2)
 
 
 def test_nearest_bins_at_and_beyond_the_edges() -> None:

@@ -11,10 +11,11 @@ import torch
 
 from tests.training import toy
 from training.acquisition import rollout, sample_queries
+from training.build import build_model
 from training.checkpoint import load_trained
 from training.config import TrainConfig
 from training.traces import load_traces
-from training.train import TrainState, build_model, main, train
+from training.train import TrainState, main, train
 
 
 def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Path, TrainState]) -> None:
@@ -22,29 +23,40 @@ def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Pat
     _, state = trained
     traces, model = load_traces(dataset), state.model
     first = slice(0, int(traces.lengths_E[0]))
-    context = model.context(traces.free_SF[first][None], traces.returns_to_go_S[first][None, :, None])
-    costly = traces.costly_SD[first].float()[None]
+    togo = traces.returns_to_go_S[first][None, :, None]
+    target_cost = torch.full_like(togo, 0.2)
     with torch.no_grad():
-        query, _ = sample_queries(model, context, costly, torch.full((1, first.stop, 4), 0.5))
-        sampled = rollout(model, context, costly, query)
+        known = model.know(traces.free_SF[first][None], togo, target_cost, traces.costly_SD[first].float()[None])
+        query, _ = sample_queries(model, known, torch.full((1, first.stop, 4), 0.5))
+        sampled = rollout(model, known, query)
         push = model.actions(sampled.hidden_BTW, torch.zeros(1, first.stop, 2))[0, :, 0]
     left, right, noise, dear = sampled.probs_BTM[0].mean(0).tolist()
     assert max(noise, dear) < 0.2 < 0.5 < max(left, right)
     assert (push == traces.actions_SA[first, 0]).float().mean() > 0.8
-    assert 0.0 < state.penalty_weight <= 250 * 0.01 + 1e-9
+    assert 0.0 < state.control.weights[0] <= 250 * 0.01 + 1e-9
 
 
-def test_a_stopped_run_resumes_to_the_same_weights(dataset: Path, tmp_path: Path) -> None:
-    whole = train(toy.config(dataset, tmp_path / "whole", updates=30, checkpoint_every=8))
-    halves = toy.config(dataset, tmp_path / "halves", updates=30, checkpoint_every=8)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"budgets": (0.05, 0.3, 1.0), "control": "dual", "allocation": "frame", "frame_bots": 4},
+        {"method": "iql", "budgets": (0.05, 1.0), "control": "dual"},
+    ],
+    ids=["algorithm-1", "conditioned", "iql"],
+)
+def test_a_stopped_run_resumes_to_the_same_weights(dataset: Path, tmp_path: Path, settings: dict[str, object]) -> None:
+    whole = train(toy.config(dataset, tmp_path / "whole", updates=30, checkpoint_every=8, **settings))
+    halves = toy.config(dataset, tmp_path / "halves", updates=30, checkpoint_every=8, **settings)
     train_interrupted(halves, after=17)
     resumed = train(halves)
     assert resumed.done == 30
-    assert resumed.penalty_weight == whole.penalty_weight
+    assert resumed.control.weights == whole.control.weights
     lines = [json.loads(line) for line in (tmp_path / "halves" / "metrics.jsonl").read_text().splitlines()]
     assert [line["update"] for line in lines] == [10, 20, 30]
-    # Every update takes as many steps as its windows are long; a mean says so even where a resumed run cut it short.
-    assert [line["passes"] for line in lines] == [12.0] * 3
+    # Every update takes as many steps as its windows are long (one pass without memory); a mean says so even where a
+    # resumed run cut it short.
+    assert [line["passes"] for line in lines] == [1.0 if settings.get("method") else 12.0] * 3
     for name, value in whole.model.state_dict().items():
         assert torch.equal(value, resumed.model.state_dict()[name]), name
 
@@ -97,6 +109,10 @@ def test_refuses_to_resume_with_other_settings(dataset: Path, tmp_path: Path) ->
         ("bins", (3, 1), "2 or more for each"),
         ("width", 15, "not a multiple"),
         ("context_length", 1, "2 or more"),
+        ("budgets", (0.1,), "two or more rising edges"),
+        ("budgets", (0.5, 0.1), "two or more rising edges"),
+        ("budgets", (0.0, 0.1), "shares above 0"),
+        ("allocation", "frame", "not a multiple of frame_bots"),
     ],
 )
 def test_refuses_settings_that_cannot_be(dataset: Path, setting: str, value: object, message: str) -> None:

@@ -1,0 +1,67 @@
+"""IQL's critics on a chain whose values are known."""
+
+from __future__ import annotations
+
+import torch
+
+from training.iql import Critics
+
+
+def chain(length: int) -> tuple[torch.Tensor, ...]:
+    """Two sorts of episodes: action 1 earns a reward of 1 a step, action 0 none. State: one-hot timestep."""
+    state = torch.eye(length).expand(2, -1, -1)
+    action = torch.tensor([0.0, 1.0])[:, None, None].expand(2, length, 1)
+    rewards = action[..., 0]
+    togo = rewards.flip(1).cumsum(1).flip(1)
+    last = torch.zeros(2, length)
+    last[:, -1] = 1.0
+    return state, action, togo, last, torch.ones(2, length)
+
+
+def test_values_and_weights_favour_the_action_that_earns() -> None:
+    torch.manual_seed(0)
+    state, action, togo, last, valid = chain(4)
+    critics = Critics(4, 1, reward_scale=1.0)
+    optimiser = torch.optim.Adam([p for p in critics.parameters() if p.requires_grad], lr=3e-3)
+    for _ in range(600):
+        optimiser.zero_grad()
+        critics.loss(state, action, togo, last, valid).backward()
+        optimiser.step()
+        critics.follow()
+    value = critics.value(state)[0, :, 0]
+    assert (value[:-1] > value[1:]).all(), "more is left to earn earlier in the chain"
+    weights = critics.weights(state, action)
+    assert (weights[1] > 3 * weights[0]).all()
+    assert (weights <= 100.0).all()
+
+
+def test_a_windows_last_timestep_without_successor_teaches_q_nothing() -> None:
+    torch.manual_seed(0)
+    state, action, togo, last, valid = chain(4)
+    cut = torch.zeros_like(last)  # the window ends before the episode does
+    critics = Critics(4, 1, reward_scale=1.0)
+
+    def q_gradient(returns: torch.Tensor) -> torch.Tensor:
+        critics.zero_grad()
+        critics.loss(state, action, returns, cut, valid).backward()
+        return critics.q[0][0].weight.grad[:, 3].clone()  # what the last timestep's one-hot moves
+
+    assert (q_gradient(togo) == 0).all()
+    critics.zero_grad()
+    critics.loss(state, action, togo, last, valid).backward()
+    assert (critics.q[0][0].weight.grad[:, 3] != 0).any()
+
+
+def test_padding_and_rewards_after_the_end_do_not_count() -> None:
+    torch.manual_seed(0)
+    state, action, togo, last, valid = chain(4)
+    critics = Critics(4, 1, reward_scale=1.0)
+    ends = torch.zeros_like(last)
+    ends[:, 1] = 1.0
+    padded = valid.clone()
+    padded[:, 2:] = 0.0
+    other_state, other_togo = state.clone(), togo.clone()
+    other_state[:, 2:] += 9.0
+    other_togo[:, 2:] += 9.0
+    first = critics.loss(state, action, togo, ends, padded)
+    assert torch.allclose(first, critics.loss(other_state, action, other_togo, ends, padded))

@@ -1,0 +1,67 @@
+"""From a configuration and traces to a network that is normalised by them.
+
+This module knows nothing about losses, sampling or files.
+"""
+
+from __future__ import annotations
+
+from training.config import TrainConfig
+from training.iql import Critics
+from training.mlp import BudgetedPerceptron
+from training.models import BudgetedDecisionTransformer
+from training.policy import BudgetedPolicy, ModelConfig
+from training.traces import Traces, moments
+
+__all__ = ["build_critics", "build_model", "make_policy"]
+
+_RETURN_DEVIATION = 30.0  # of returns-to-go after scaling, about what IQL's authors' locomotion rewards have
+
+
+def make_policy(config: ModelConfig) -> BudgetedPolicy:
+    """An untrained network of the method that `config` names."""
+    return BudgetedDecisionTransformer(config) if config.has_memory else BudgetedPerceptron(config)
+
+
+def build_model(config: TrainConfig, traces: Traces) -> BudgetedPolicy:
+    """A network for these traces, normalised by them. Raises ValueError where the action layout is another."""
+    components = traces.action.components
+    if len(config.bins) != len(components):
+        raise ValueError(f"bins has {len(config.bins)} numbers, the action has {len(components)} components")
+    names = [component.name for component in components]
+    if unknown := set(config.sampled) - set(names):
+        raise ValueError(f"sampled names {sorted(unknown)}, the action has {names}")
+    model = make_policy(
+        ModelConfig(
+            n_free=traces.features.n_free,
+            owner=tuple(int(i) for i in traces.features.owner),
+            n_queries=traces.features.n_queries,
+            bins=config.bins,
+            low=tuple(component.low for component in components),
+            high=tuple(component.high for component in components),
+            sampled=tuple(component.name in config.sampled for component in components),
+            method=config.method,
+            context_length=config.context_length if config.method == "bdt" else 1,
+            width=config.width,
+            n_layers=config.n_layers,
+            n_heads=config.n_heads,
+            encoder_width=config.encoder_width,
+            fourier=config.fourier,
+            acquisition=config.acquisition,
+            acquisition_bias=config.acquisition_bias,
+            target_cost=config.budget,
+            budget_conditioned=bool(config.budgets),
+        )
+    )
+    model.normalise_free.fit(*moments(traces.free_SF))
+    model.normalise_costly.fit(*moments(traces.costly_SD))
+    model.normalise_return.fit(*moments(traces.returns_to_go_S[:, None]))
+    return model
+
+
+def build_critics(model: BudgetedPolicy) -> Critics | None:
+    """IQL's critics for this policy; the other methods have none."""
+    if model.config.method != "iql":
+        return None
+    context = model.encode_context.in_features
+    scale = float(model.normalise_return.scale) / _RETURN_DEVIATION
+    return Critics(context + len(model.config.owner), len(model.config.bins), scale)

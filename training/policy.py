@@ -1,0 +1,199 @@
+"""What every budgeted policy shares: its inputs, its acquisition head π̂ and its action head π̃.
+
+A subclass says what it remembers (`memory`, what π̂ reads of the past) and how a frame becomes the state that π̃ reads
+(`hiddens`). This module knows nothing about losses, sampling or files. Shape letters: B batch, T time, W width of the
+state, E encoder width, C numbers known before the query; F free numbers, M costly features, D costly numbers, A action
+components; `...` any leading axes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+__all__ = ["BudgetedPolicy", "ModelConfig", "Normalisation"]
+
+_LEAST_COST = 1e-3  # shares of the full cost below this one are one and the same to the acquisition head
+_COST_OCTAVES = 3
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes of one network."""
+
+    n_free: int  # F
+    owner: tuple[int, ...]  # costly feature that each of the D costly numbers belongs to
+    n_queries: int  # M
+    bins: tuple[int, ...]  # bins of each action component, A of them
+    low: tuple[float, ...]  # lowest value of each action component
+    high: tuple[float, ...]  # highest value of each action component
+    sampled: tuple[bool, ...]  # True: the component is sampled from its bins, False: the most probable bin is taken
+    method: str = "bdt"  # bdt | rcbc | bc | iql
+    context_length: int = 20  # K, the attention span in timesteps; 1: no memory
+    width: int = 64  # W
+    n_layers: int = 2  # L
+    n_heads: int = 4  # H
+    encoder_width: int = 128  # E, hidden width of the token encoder and of the acquisition head
+    fourier: int = 4  # sine/cosine octaves of each free number: positions must be told apart finely
+    acquisition: str = "learned"  # learned | random | all | none: whether queries are learned, drawn, or forced
+    acquisition_bias: float = 0.0  # initial logit of every query probability
+    target_cost: float = 1.0  # C, where it is no input
+    budget_conditioned: bool = False  # C is an input of the acquisition head
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether a frame's outcome depends on the frames before it."""
+        return self.method == "bdt"
+
+    @property
+    def reads_returns(self) -> bool:
+        """Whether the return-to-go is an input: behavioural cloning and IQL have none."""
+        return self.method in ("bdt", "rcbc")
+
+
+class Normalisation(nn.Module):
+    """(x - mean) / scale per number; lives inside the network so that an engine sends raw numbers."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+
+    def fit(self, mean: Tensor, scale: Tensor) -> None:
+        """Take the statistics of the traces, each shape [size]; scales must be positive."""
+        self.mean.copy_(mean)
+        self.scale.copy_(scale)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - self.mean) / self.scale
+
+
+class AcquisitionHead(nn.Module):
+    """Logits of the query from what is remembered and what is known before it. One hidden layer, whose two inputs have
+    weights of their own: what does not depend on the query is computed for a whole window at once."""
+
+    def __init__(self, memory: int, context: int, config: ModelConfig) -> None:
+        super().__init__()
+        self.from_memory = nn.Linear(memory, config.encoder_width, bias=False) if memory else None
+        self.from_context = nn.Linear(context, config.encoder_width)
+        self.out = nn.Linear(config.encoder_width, config.n_queries)
+        nn.init.zeros_(self.out.weight)
+        nn.init.constant_(self.out.bias, config.acquisition_bias)
+
+    def forward(self, memory: Tensor, prepared: Tensor) -> Tensor:
+        """`prepared` [..., E] is `from_context` of what is known before the query."""
+        if self.from_memory is not None:
+            prepared = prepared + self.from_memory(memory)
+        return self.out(functional.gelu(prepared, approximate="tanh"))
+
+
+@dataclass(frozen=True)
+class Known:
+    """What does not depend on the query, computed once for a window."""
+
+    acquisition: Tensor  # [..., E], into the acquisition head
+    token: Tensor  # [..., E], into the encoder
+    costly: Tensor  # [..., D], normalised
+    target_cost: Tensor  # C, [..., 1]
+
+    def at(self, t: int) -> Known:
+        """Timestep `t` of [B, T, ...]."""
+        return Known(self.acquisition[:, t], self.token[:, t], self.costly[:, t], self.target_cost[:, t])
+
+    def rows(self, index_B: Tensor) -> Known:
+        """Some of the sequences."""
+        return Known(self.acquisition[index_B], self.token[index_B], self.costly[index_B], self.target_cost[index_B])
+
+
+class BudgetedPolicy(nn.Module):
+    """π̂ and π̃; raw numbers in, probabilities and bin logits out."""
+
+    owner: Tensor
+
+    def __init__(self, config: ModelConfig, memory: int) -> None:
+        """`memory`: numbers that the acquisition head reads of the past, 0 for none."""
+        super().__init__()
+        self.config, self.memory_width = config, memory
+        n_costly, n_context = len(config.owner), config.n_free * (1 + 2 * config.fourier) + 1
+        self.register_buffer("owner", torch.tensor(config.owner, dtype=torch.long))
+        self.normalise_free = Normalisation(config.n_free)
+        self.normalise_costly = Normalisation(n_costly)
+        self.normalise_return = Normalisation(1)
+        self.encode_acquired = nn.Linear(n_costly + config.n_queries, config.encoder_width, bias=False)
+        self.encode_context = nn.Linear(n_context, config.encoder_width)
+        n_cost = 1 + 2 * _COST_OCTAVES if config.budget_conditioned else 0
+        self.acquisition_head = AcquisitionHead(memory, n_context + n_cost, config)
+        self.action_head = nn.Linear(config.width, sum(config.bins))
+
+    def context(self, free: Tensor, returns_to_go: Tensor) -> Tensor:
+        """Free features [..., F] with their Fourier octaves, and the return-to-go [..., 1]: known before the query."""
+        z = self.normalise_free(free)
+        octaves = [z] + [
+            wave(z * (math.pi / 2) * 2**k) for k in range(self.config.fourier) for wave in (torch.sin, torch.cos)
+        ]
+        togo = self.normalise_return(returns_to_go)
+        return torch.cat([*octaves, togo if self.config.reads_returns else torch.zeros_like(togo)], dim=-1)
+
+    def know(self, free: Tensor, returns_to_go: Tensor, target_cost: Tensor, costly: Tensor | None = None) -> Known:
+        """All that does not depend on the query: free [..., F], returns_to_go [..., 1], target_cost C [..., 1], and
+        costly [..., D] (None where only the query is wanted)."""
+        context = self.context(free, returns_to_go)
+        before = torch.cat([context, _cost_waves(target_cost)], -1) if self.config.budget_conditioned else context
+        normalised = free[..., :0] if costly is None else self.normalise_costly(costly)
+        return Known(self.acquisition_head.from_context(before), self.encode_context(context), normalised, target_cost)
+
+    def query_probs(self, memory: Tensor, known: Known) -> Tensor:
+        """q̃_t, the Bernoulli means of the query, [..., M]; C itself where acquisition is random, ones or zeros where
+        it is forced."""
+        logits = self.acquisition_head(memory, known.acquisition)
+        match self.config.acquisition:
+            case "learned":
+                return torch.sigmoid(logits)
+            case "random":
+                return torch.zeros_like(logits) + known.target_cost
+        return torch.zeros_like(logits) + float(self.config.acquisition == "all")
+
+    def encode(self, known: Known, query: Tensor) -> Tensor:
+        """First hidden layer of W[q_t∘o_t, q_t, free_t, R_t], [..., E]; values not acquired cannot enter."""
+        acquired = known.costly * query.index_select(-1, self.owner)
+        mixed = known.token + self.encode_acquired(torch.cat([acquired, query], dim=-1))
+        return functional.gelu(mixed, approximate="tanh")
+
+    def hiddens(self, known: Known, query_BTM: Tensor) -> Tensor:
+        """The state that the action head reads at every timestep, [B, T, W]."""
+        raise NotImplementedError
+
+    def memory(self, hidden_BTW: Tensor) -> Tensor:
+        """What the acquisition head reads of the past at every timestep, [B, T, memory]."""
+        raise NotImplementedError
+
+    def action_logits(self, hidden: Tensor) -> list[Tensor]:
+        """Logits over the bins of each action component: A tensors [..., bins]."""
+        return list(self.action_head(hidden).split(self.config.bins, dim=-1))
+
+    def actions(self, hidden: Tensor, noise: Tensor) -> Tensor:
+        """Raw action numbers [..., A]; `noise` [..., A] uniform in [0, 1) drives the components that are sampled."""
+        config = self.config
+        chosen = []
+        for i, logits in enumerate(self.action_logits(hidden)):
+            if config.sampled[i]:
+                cumulative = torch.softmax(logits, dim=-1).cumsum(-1)
+                bin_ = (noise[..., i : i + 1] >= cumulative[..., :-1]).to(logits.dtype).sum(-1)
+            else:
+                bin_ = logits.argmax(-1).to(logits.dtype)
+            chosen.append(config.low[i] + bin_ * ((config.high[i] - config.low[i]) / (config.bins[i] - 1)))
+        return torch.stack(chosen, dim=-1)
+
+
+def _cost_waves(target_cost: Tensor) -> Tensor:
+    """C on a logarithmic scale, 0 at a thousandth and 1 at all, with sines and cosines of it, [..., 7]."""
+    z = 1.0 + torch.log10(target_cost.clamp(_LEAST_COST, 1.0)) / -math.log10(_LEAST_COST)
+    waves = [wave(z * math.pi * 2**k) for k in range(_COST_OCTAVES) for wave in (torch.sin, torch.cos)]
+    return torch.cat([z, *waves], dim=-1)

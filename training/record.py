@@ -1,0 +1,92 @@
+"""The outside of a run: progress, metrics and checkpoints. An interrupted run goes on from its last checkpoint."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import torch
+from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.utils.tensorboard import SummaryWriter
+
+from training.checkpoint import Facts, save_checkpoint
+from training.config import TrainConfig
+from training.traces import Traces
+
+if TYPE_CHECKING:
+    from training.train import TrainState
+
+__all__ = ["RunRecord", "write_versions"]
+
+
+class RunRecord:
+    """Writes metrics.jsonl, TensorBoard and checkpoint.pt of one run; call `record` after every update."""
+
+    def __init__(
+        self, config: TrainConfig, state: TrainState, facts: Facts, held_out: Callable[[], dict[str, float]]
+    ) -> None:
+        """`held_out` measures what is only measured once a line."""
+        self._config, self._state, self._facts, self._held_out = config, state, facts, held_out
+        self._checkpoint = config.out / "checkpoint.pt"
+        self._sums: dict[str, float] = {}
+        self._counts: dict[str, int] = {}  # updates in each sum: a stratum is not in every batch
+        self._began = time.monotonic() - state.seconds
+        metrics = config.out / "metrics.jsonl"
+        if metrics.exists():  # lines that came after the checkpoint will come again
+            kept = [line for line in metrics.read_text().splitlines(True) if json.loads(line)["update"] <= state.done]
+            metrics.write_text("".join(kept))
+        self._lines = metrics.open("a")
+        self._board = SummaryWriter(str(config.out), purge_step=state.done + 1)
+        columns = (*Progress.get_default_columns()[:2], TimeElapsedColumn(), TimeRemainingColumn())
+        self._progress = Progress(*columns, TextColumn("{task.fields[now]}"))
+        self._task = self._progress.add_task(config.name, total=config.updates, completed=state.done, now="")
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+        self._board.close()
+        self._lines.close()
+
+    def record(self) -> None:
+        """Count the update that was just made."""
+        state, config = self._state, self._config
+        state.seconds = time.monotonic() - self._began
+        for key, value in state.metrics.items():
+            self._sums[key] = self._sums.get(key, 0.0) + value
+            self._counts[key] = self._counts.get(key, 0) + 1
+        self._progress.update(self._task, completed=state.done)
+        if state.done % config.log_every == 0:
+            self._log({key: value / self._counts[key] for key, value in self._sums.items()} | self._held_out())
+            self._sums.clear()
+            self._counts.clear()
+        if state.done % config.checkpoint_every == 0 or state.done == config.updates:
+            save_checkpoint(self._checkpoint, config, self._facts, state)
+
+    def _log(self, means: dict[str, float]) -> None:
+        line = {"update": self._state.done, "seconds": round(self._state.seconds, 1), **means}
+        self._lines.write(json.dumps(line) + "\n")
+        self._lines.flush()
+        for key, value in means.items():
+            self._board.add_scalar(key, value, self._state.done)
+        now = " ".join(f"{key} {means[key]:.3g}" for key in ("delta", "held_out", "cost", "gamma") if key in means)
+        self._progress.update(self._task, now=now)
+
+
+def write_versions(path: Path, traces: Traces) -> None:
+    """What made a run: versions of the libraries, threads, and how much was read."""
+    versions = {name: importlib.metadata.version(name) for name in ("torch", "onnx", "onnxruntime", "numpy", "minari")}
+    versions |= {
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "threads": str(torch.get_num_threads()),
+    }
+    versions |= {"episodes": str(len(traces.lengths_E)), "steps": str(int(traces.lengths_E.sum()))}
+    path.write_text(json.dumps(versions, indent=2) + "\n")
