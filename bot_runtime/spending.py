@@ -66,7 +66,8 @@ class Spending:
 
     def __init__(self, manifest: Manifest, capacity: int) -> None:
         self._default_us = np.inf if manifest.is_unlimited else manifest.budget_us
-        self._default_share = 0.0 if manifest.target_cost is None else manifest.target_cost
+        self._is_conditioned = manifest.is_conditioned
+        self._default_share = manifest.target_cost or 0.0
         self._costs_BM = np.zeros((capacity, manifest.features.n_queries))
         self._calls_B = np.zeros(capacity)
         self._full_B = np.zeros(capacity)
@@ -92,15 +93,19 @@ class Spending:
 
         The target cost is the first of: the frame's target cost, the frame's budget, the start's target cost, the
         start's budget, the bundle's default; and never more than the bot may spend, be it the budget in force or an
-        equal part of the budget that the bots share. Where nothing costs anything it is 1.
+        equal part of the budget that the bots share. Where nothing costs anything it is 1. Where the network does not
+        read it, it is 0, for those few µs count in every frame.
         """
         budgets_N = said.budgets_N if said.budgets_N.size else self._budgets_B[slots_N]
+        share_N = self._shares(slots_N, said, budgets_N) if self._is_conditioned else np.zeros(slots_N.size)
+        return Terms(self._costs_BM[slots_N], self._calls_B[slots_N], budgets_N, share_N.astype(np.float32))
+
+    def _shares(self, slots_N: NDArray[np.int64], said: Limits, budgets_N: _Floats) -> _Floats:
         target_us_N = np.minimum(_first(said.targets_N, said.budgets_N, self._targets_B[slots_N]), budgets_N)
         if said.shared_1.size:
             target_us_N = np.minimum(target_us_N, said.shared_1 / slots_N.size)
         full_N = self._full_B[slots_N]
-        share_N = np.divide(np.minimum(target_us_N, full_N), full_N, out=np.ones_like(full_N), where=full_N > 0.0)
-        return Terms(self._costs_BM[slots_N], self._calls_B[slots_N], budgets_N, share_N.astype(np.float32))
+        return np.divide(np.minimum(target_us_N, full_N), full_N, out=np.ones_like(full_N), where=full_N > 0.0)
 
 
 def _checked(name: str, numbers: _Numbers, size: int) -> _Floats:
