@@ -23,6 +23,8 @@ from training.heat_map import HeatMap
 from training.sweep import Outcome, SweepConfig, main, sweep
 from training.sweep_spec import SweepSpec
 
+pytestmark = pytest.mark.timeout(300)  # each run imports torch and exports: long on a busy machine
+
 EVALUATE: dict[str, object] = {"episodes": 3, "heat_map": True}
 DONE = ["bdt-learned-test-v0-c0_2-s0", "bdt-all-test-v0-s0"]
 BROKEN = "bdt-learned-nothing-v0-c0_1-s0"
