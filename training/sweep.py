@@ -69,7 +69,7 @@ class Outcome:
 
     run: Run
     state: str  # done now, done before, failed; new or begun in a dry run
-    detail: str = ""  # seconds, or why it failed
+    reason: str = ""  # why it failed
 
 
 def sweep(config: SweepConfig, console: Console | None = None) -> list[Outcome]:
@@ -102,14 +102,13 @@ def _state(run: Run) -> str:
 
 
 def _finish(pending: dict[Future[str], Run], watch: _Watch) -> Iterator[Outcome]:
-    began = time.monotonic()
     while pending:
         finished, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
         for future in finished:
             run = pending.pop(future)
             error = future.exception()
             reason = future.result() if error is None else (str(error).strip().splitlines() or [repr(error)])[-1]
-            outcome = Outcome(run, "failed" if reason else "done", reason or f"after {time.monotonic() - began:.0f} s")
+            outcome = Outcome(run, "failed" if reason else "done", reason)
             watch.finished(outcome)
             yield outcome
         watch.look(list(pending.values()))
@@ -204,7 +203,8 @@ class _Watch:
         """Take the run's line away, and say what became of it."""
         if outcome.run.name in self._lines:
             self._progress.remove_task(self._lines.pop(outcome.run.name))
-        self._progress.console.print(f"{outcome.run.name}: {outcome.state} {escape(outcome.detail)}")
+        line = f"{outcome.run.name}: {outcome.state} {escape(outcome.reason)}"
+        self._progress.console.print(line, soft_wrap=True)
         self._progress.advance(self._all)
 
 
@@ -220,13 +220,15 @@ def _write_about(config: SweepConfig, out: Path, names: list[str]) -> None:
 
 
 def _table(outcomes: list[Outcome]) -> Table:
-    table = Table("run", "state", "updates", "still to evaluate", box=None)
-    table.add_column("", overflow="fold")
+    table = Table(box=None)
+    table.add_column("run", no_wrap=True)
+    for name in ("state", "updates", "still to evaluate", ""):
+        table.add_column(name, overflow="fold")
     for outcome in outcomes:
         run = outcome.run
+        where = f"see {run.config.out / 'log.txt'}" if outcome.state == "failed" else ""
         updates = f"{run.progress()}/{run.config.updates}"
-        detail = f"{outcome.detail} ({run.config.out / 'log.txt'})" if outcome.state == "failed" else outcome.detail
-        table.add_row(run.name, outcome.state, updates, " ".join(run.missing()), escape(detail))
+        table.add_row(run.name, outcome.state, updates, " ".join(run.missing()), escape(where))
     return table
 
 

@@ -64,10 +64,10 @@ def test_a_run_that_fails_says_why_and_stops_no_other(outcomes: list[Outcome], r
         (BROKEN, "failed"),
         (DONE[1], "done"),
     ]
-    assert "nothing-v0" in outcomes[1].detail
+    assert "nothing-v0" in outcomes[1].reason
     log = (results / BROKEN / "log.txt").read_text()
     assert "Traceback (most recent call last)" in log
-    assert log.strip().endswith(outcomes[1].detail)
+    assert log.strip().endswith(outcomes[1].reason)
 
 
 def test_a_run_leaves_all_its_parts(results: Path) -> None:
@@ -214,7 +214,7 @@ def test_two_sweeps_do_not_write_one_folder(dataset: Path, tmp_path: Path, monke
     with (run.config.out / "log.txt").open("ab") as log:
         assert sweep_run._lock(log)
         (outcome,) = sweep(SweepConfig(spec))
-    assert (outcome.state, outcome.detail) == ("failed", f"another process is at work in {run.config.out}")
+    assert (outcome.state, outcome.reason) == ("failed", f"another process is at work in {run.config.out}")
 
 
 def test_a_run_that_is_killed_is_reported(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,7 +228,7 @@ def test_a_run_that_is_killed_is_reported(dataset: Path, tmp_path: Path, monkeyp
 
     monkeypatch.setattr(sweep_run, "_tell", tell_and_kill)
     (outcome,) = sweep(SweepConfig(spec))
-    assert (outcome.state, outcome.detail) == ("failed", "killed by SIGKILL")
+    assert (outcome.state, outcome.reason) == ("failed", "killed by SIGKILL")
 
 
 def test_a_new_setting_at_its_default_changes_no_old_run(dataset: Path, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def test_a_sweep_on_a_real_ray(dataset: Path, tmp_path: Path) -> None:
     config = SweepConfig(spec, workers=2, threads=1, ray="local")
     outcomes = sweep(config)
     assert [outcome.state for outcome in outcomes] == ["done", "done", "failed"]
-    assert "nothing" in outcomes[2].detail
+    assert "nothing" in outcomes[2].reason
     for outcome in outcomes[:2]:
         assert Bundle.load(outcome.run.bundle).name == outcome.run.name
     assert [outcome.state for outcome in sweep(SweepConfig(spec, ray="local", only="*test-v0*"))] == ["done before"] * 2
