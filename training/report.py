@@ -147,6 +147,7 @@ def _figure(figure: Figure, out: Path, title: str, caption: str) -> str:
     name = re.sub(r"[^a-z0-9.]+", "-", title.lower())
     with matplotlib.rc_context({"svg.hashsalt": name}):  # the same figure is the same file
         figure.savefig(out / "figures" / f"{name}.png", dpi=150)
+        figure.set_layout_engine("none")  # it is laid out now
         figure.savefig(out / "figures" / f"{name}.svg", metadata={"Date": None})
     return f"![{caption}](figures/{name}.png)\n\n*{caption}* ([SVG](figures/{name}.svg))\n"
 
