@@ -19,7 +19,7 @@ ARROWS = {  # room -> rooms that it may import, besides itself
     "benchmarks": {"protocol", "bot_runtime", "server", "training", "game"},
 }
 RUN_TIME = ("protocol", "bot_runtime", "server", "game")
-HEAVY = {"torch", "onnx", "tensorboard"}
+HEAVY = {"torch", "onnx", "tensorboard", "ray"}
 PROTOCOL_NEEDS = {"msgspec", "msgpack", "numpy"} | sys.stdlib_module_names
 FILES = [file for room in ARROWS for file in sorted((ROOT / room).rglob("*.py"))]
 
