@@ -186,7 +186,8 @@ def _summary(
 def _frame_mean_pct(episodes: list[Episode], name: str) -> float:
     """Mean over frames, not over episodes: a frame is what an engine pays for."""
     frames = sum(episode.frames for episode in episodes)
-    return 100.0 * sum(getattr(episode, name) * episode.frames for episode in episodes) / frames
+    total: float = sum(getattr(episode, name) * episode.frames for episode in episodes)
+    return 100.0 * total / frames
 
 
 def _write_heat_map(path: Path, groups: list[Group], manifest: Manifest) -> None:

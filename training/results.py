@@ -61,7 +61,7 @@ class Series(NamedTuple):
             method += " conditioned"
         if config.acquisition != "learned":
             return cls(method)
-        parts = [config.control] if config.control != "algorithm-1" else []
+        parts: list[str] = [config.control] if config.control != "algorithm-1" else []
         parts += [f"{config.allocation} allocation"] if config.allocation != "none" else []
         return cls(method, ", ".join(parts))
 

@@ -125,7 +125,7 @@ def _with_seeds(stat: Statistic | None) -> str:
 
 
 def _percent(share_pct: float) -> str:
-    return f"{share_pct:.1f} %" if share_pct >= 1.0 or share_pct == 0.0 else f"{share_pct:.2g} %"
+    return f"{share_pct:.1f} %" if share_pct >= 0.95 or share_pct == 0.0 else f"{share_pct:.2g} %"
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
