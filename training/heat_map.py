@@ -27,6 +27,12 @@ class HeatMap(NamedTuple):
     costs_M: NDArray[np.float64]
     names: tuple[str, ...]
 
+    @property
+    def cost_pct(self) -> float:
+        """What was asked for on average, % of the full cost: the soft cost of the evaluation that made this."""
+        cost_T = self.probs_TM.astype(np.float64) @ self.costs_M / self.costs_M.sum()
+        return 100.0 * float(cost_T @ self.alive_T / self.alive_T.sum())
+
     def write(self, path: Path) -> None:
         """Write an .npz with these four arrays, at exactly `path`."""
         with path.open("wb") as file:

@@ -5,6 +5,7 @@ Writes report.md, and every figure as PNG and SVG. This module knows nothing abo
 
 from __future__ import annotations
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -31,6 +32,7 @@ play at once, and shows what it allowed of what was asked for. R is the mean ret
 over training seeds, n of them; one seed has none. Costs are shares of the cost of all features, averaged over frames.
 """
 _PAPER = "\nFigures in *italics* and hollow markers are the paper's own, measured in its own environment.\n"
+_SAME_COST = 1e-4  # relative: a heat map is rounded to float32, and no two evaluations spend the same
 
 
 @dataclass(frozen=True)
@@ -100,31 +102,32 @@ def _at_equal_spend(
 
 def _heat_maps(runs: Sequence[Run], measurements: Sequence[Measurement], setting: Setting, out: Path) -> Iterator[str]:
     """One figure a C: the first seed of each series, side by side."""
-    by_cost: dict[float, dict[str, Run]] = defaultdict(dict)
+    by_cost: dict[str, dict[str, tuple[Run, HeatMap]]] = defaultdict(dict)
     for run in sorted(runs, key=lambda run: (run.config.method, run.series, run.config.seed)):
         if (run.folder / "heat_map.npz").exists():
-            by_cost[_heat_map_cost(run, measurements)].setdefault(str(run.series), run)
+            heat = HeatMap.read(run.folder / "heat_map.npz")
+            by_cost[_heat_map_cost(run, heat, measurements)].setdefault(str(run.series), (run, heat))
     for cost, shown in sorted(by_cost.items()):
-        heats = {name: HeatMap.read(run.folder / "heat_map.npz") for name, run in shown.items()}
-        panels = [Panel(f"{name}\n{setting}, C = {cost:g}", heat) for name, heat in heats.items()]
-        episodes = _range(int(heat.alive_T[0]) for heat in heats.values())
-        seeds = _list(run.config.seed for run in shown.values())
+        panels = [Panel(f"{name}\n{setting}, C = {cost}", heat) for name, (_, heat) in shown.items()]
+        episodes = _range(int(heat.alive_T[0]) for _, heat in shown.values())
+        seeds = _list(run.config.seed for run, _ in shown.values())
         caption = (
             f"Query probability of each feature at each timestep, mean over the episodes alive then (timesteps that "
-            f"{LEAST_ALIVE:.0%} of them reach), C = {cost:g}, no cap. {episodes} episodes, training seed {seeds}."
+            f"{LEAST_ALIVE:.0%} of them reach), C = {cost}. {episodes} episodes, training seed {seeds}."
         )
-        yield _figure(heat_map_figure(panels), out, f"heat-map-{setting}-c{cost:g}", caption)
+        yield _figure(heat_map_figure(panels), out, f"heat-map-{setting}-c{cost}", caption)
 
 
-def _heat_map_cost(run: Run, measurements: Iterable[Measurement]) -> float:
-    """C of the evaluation that made a run's heat map: the soft one nearest to the budget of its configuration."""
-    budget = run.config.budget
-    asked = [
-        float(one.constraint)
+def _heat_map_cost(run: Run, heat: HeatMap, measurements: Iterable[Measurement]) -> str:
+    """C that a heat map was made at: the run's own, or that of the evaluation that asked for as much."""
+    if not run.config.budgets:
+        return f"{run.config.budget:g}"
+    made = [
+        one.constraint
         for one in measurements
-        if one.run is run and one.kind == "soft" and not isinstance(one.constraint, str)
+        if one.run is run and math.isclose(one.numbers.soft_cost_pct, heat.cost_pct, rel_tol=_SAME_COST)
     ]
-    return min(asked, key=lambda cost: abs(cost - budget), default=budget)
+    return f"{made[0]:g}" if made and not isinstance(made[0], str) else "unknown"
 
 
 def _training(runs: Sequence[Run], setting: Setting, out: Path) -> Iterator[str]:

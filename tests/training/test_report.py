@@ -170,6 +170,15 @@ def test_a_heat_map_leaves_out_what_few_episodes_reach(tmp_path: Path) -> None:
         heat_map_figure([Panel("BDT", heat), Panel("RCBC", heat._replace(names=tuple(reversed(NAMES))))])
 
 
+def test_a_heat_map_of_a_conditioned_network_is_known_by_what_it_asked_for(tmp_path: Path) -> None:
+    run = write_run(tmp_path, "run", budget=0.1, **CONDITIONED)
+    write_heat_map(run)
+    write_evaluation(run, "soft-0.1", 80.0, 9.0, 9.0)
+    assert "C = unknown. 256 episodes" in report(ReportConfig(tmp_path)).read_text()
+    write_evaluation(run, "soft-0.01", 80.0, HeatMap.read(run / "heat_map.npz").cost_pct, 9.0)
+    assert "C = 0.01. 256 episodes" in report(ReportConfig(tmp_path)).read_text()
+
+
 @pytest.mark.parametrize("settings", [{}, CONDITIONED, {"control": "dual"}])
 def test_curves_of_one_run_are_drawn(tmp_path: Path, settings: dict[str, object]) -> None:
     run = write_run(tmp_path, "run", **settings)
