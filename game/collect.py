@@ -49,7 +49,7 @@ class Collect:
     seed: int = 0  # episode i is played with seed * 1,000,000 + i
     workers: int = os.cpu_count() or 1  # processes
     out: Path = Path("data/navigation")  # MINARI_DATASETS_PATH of the dataset
-    kick_chance: float = 0.1  # per decision; a kick disturbs what is executed, not what is recorded
+    kick_chance: float = 0.07  # per decision; a kick disturbs what is executed, not what is recorded
 
 
 def main() -> None:

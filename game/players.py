@@ -26,6 +26,8 @@ __all__ = ["Kicks", "Player"]
 _AIM_CELLS = 7
 _LEDGE_AHEAD_M = (0.35, 0.7, 1.1, 1.5)
 _ON_TOP_M = 0.05
+_KICK_TURNS = 4.0  # most that a whole kick turns, in units of 30 degrees
+_KICK_MARGIN_M = 0.3  # between what the next decision may reach and a brink
 _MARGIN_COST = 4.0
 """Cells cheaper than this may be walked straight through; dearer ones lie on the brink of a hazard."""
 
@@ -110,14 +112,14 @@ class Player:
 
 
 class Kicks:
-    """Disturbs what is executed for a few decisions now and then; what was intended is what gets recorded.
+    """Disturbs what is executed for some decisions now and then; what was intended is what gets recorded.
 
-    Often, so that where a character heads says less of what its player knows: an imitator that reads the player's mind
-    off its heading would walk into whatever it did not look at. Where a push could lead over a brink, a kick only
-    turns the character on the spot.
+    Often and for long, so that where a character heads, and has headed, says less of what its player knows: an imitator
+    that reads the player's mind off its path walks into whatever it did not look at. A kick may lead close to a brink,
+    for how to leave one must be seen too; where the next decision could lead over it, the character only turns.
     """
 
-    def __init__(self, rng: np.random.Generator, chance: float = 0.1, longest: int = 4) -> None:
+    def __init__(self, rng: np.random.Generator, chance: float = 0.07, longest: int = 12) -> None:
         self._rng, self._chance, self._longest = rng, chance, longest
         self._left = 0
         self._push = np.zeros(3, dtype=np.float32)
@@ -126,7 +128,8 @@ class Kicks:
         """The action to execute [3]."""
         if self._left == 0 and self._rng.random() < self._chance:
             self._left = int(self._rng.integers(1, self._longest, endpoint=True))
-            self._push = np.array([self._rng.uniform(-1, 1), self._rng.uniform(0.3, 1), intended[2]], dtype=np.float32)
+            turn = min(max(self._rng.uniform(-_KICK_TURNS, _KICK_TURNS) / self._left, -1.0), 1.0)
+            self._push = np.array([turn, self._rng.uniform(0.3, 1), intended[2]], dtype=np.float32)
         if self._left == 0:
             return intended
         self._left -= 1
@@ -134,7 +137,7 @@ class Kicks:
 
     def _harmless(self, env: NavigationEnv) -> bool:
         who = env.world.character
-        reach_m = SPEED_M_S * 0.1 * 2 + 0.3
+        reach_m = SPEED_M_S * 0.1 + _KICK_MARGIN_M
         heading = who.yaw + float(self._push[0]) * TURN_RAD
         x, y = who.x + reach_m * math.cos(heading), who.y + reach_m * math.sin(heading)
         return who.on_ground and not env.world.deadly(x, y)

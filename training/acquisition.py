@@ -17,11 +17,11 @@ This module knows nothing about data or optimisers. Shape letters as in `trainin
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from training.models import BudgetedDecisionTransformer
 from training.objectives import straight_through
@@ -138,21 +138,23 @@ def sample_queries_sequentially(
     return Rollout(torch.stack(queries, 1), torch.stack(probs_all, 1), torch.stack(hiddens, 1))
 
 
-def backward(sampled: Rollout, loss: Callable[[Rollout], Tensor], sweeps: int) -> Tensor:
-    """Accumulate parameter gradients of `loss` with straight-through queries; return the loss, detached.
+def backward(
+    sampled: Rollout, loss: Callable[[Rollout], Tensor], sweeps: int, parameters: Sequence[nn.Parameter]
+) -> Tensor:
+    """Accumulate gradients of `parameters` of `loss` with straight-through queries; return the loss, detached.
 
     `sampled.query_BTM` must be a leaf that requires a gradient. Each sweep but the last only moves the adjoint of the
-    queries one query further into the past; the last one also reaches the parameters.
+    queries one query further into the past; the last one reaches the parameters, and leaves the queries out.
     """
     value = loss(sampled)
     query, probs = sampled.query_BTM, sampled.probs_BTM
     if not probs.requires_grad:
-        value.backward()
+        value.backward(inputs=parameters)
         return value.detach()
     (direct,) = torch.autograd.grad(value, query, retain_graph=True)
     adjoint = direct
     for _ in range(sweeps - 1):
         (through,) = torch.autograd.grad(probs, query, grad_outputs=adjoint, retain_graph=True)
         adjoint = direct + through
-    torch.autograd.backward([value, probs], [torch.ones_like(value), adjoint])
+    torch.autograd.backward([value, probs], [torch.ones_like(value), adjoint], inputs=parameters)
     return value.detach()

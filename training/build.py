@@ -32,7 +32,7 @@ def build_model(config: TrainConfig, traces: Traces) -> BudgetedPolicy:
         raise ValueError(f"sampled names {sorted(unknown)}, the action has {names}")
     model = make_policy(
         ModelConfig(
-            n_free=traces.features.n_free,
+            octaves=_octaves(config, traces),
             owner=tuple(int(i) for i in traces.features.owner),
             n_queries=traces.features.n_queries,
             bins=config.bins,
@@ -45,7 +45,6 @@ def build_model(config: TrainConfig, traces: Traces) -> BudgetedPolicy:
             n_layers=config.n_layers,
             n_heads=config.n_heads,
             encoder_width=config.encoder_width,
-            fourier=config.fourier,
             acquisition=config.acquisition,
             acquisition_bias=config.acquisition_bias,
             target_cost=config.budget,
@@ -56,6 +55,14 @@ def build_model(config: TrainConfig, traces: Traces) -> BudgetedPolicy:
     model.normalise_costly.fit(*moments(traces.costly_SD))
     model.normalise_return.fit(*moments(traces.returns_to_go_S[:, None]))
     return model
+
+
+def _octaves(config: TrainConfig, traces: Traces) -> tuple[int, ...]:
+    """Of each free number. Raises ValueError for a feature that is not there or not free."""
+    free = traces.features.free
+    if unknown := set(config.octaves) - {feature.name for feature in free}:
+        raise ValueError(f"octaves names {sorted(unknown)}, the free features are {[feature.name for feature in free]}")
+    return tuple(config.octaves.get(feature.name, config.fourier) for feature in free for _ in range(feature.size))
 
 
 def build_critics(model: BudgetedPolicy) -> Critics | None:

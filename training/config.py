@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -51,7 +51,8 @@ class TrainConfig:
     n_layers: int = 2  # L; hidden layers of width W where there is no memory
     n_heads: int = 4  # H
     encoder_width: int = 128  # hidden width of the token encoder and acquisition head
-    fourier: int = 4  # octaves of each free number
+    fourier: int = 4  # octaves of each free number,
+    octaves: dict[str, int] = field(default_factory=dict)  # but for the free features named here
 
     batch: int = 40  # windows in an update
     updates: int = 3000
@@ -77,6 +78,8 @@ class TrainConfig:
             raise ValueError(f"bins is {self.bins}, expected 2 or more for each action component")
         if self.width % self.n_heads:
             raise ValueError(f"width {self.width} is not a multiple of n_heads {self.n_heads}")
+        if min((self.fourier, *self.octaves.values())) < 0:
+            raise ValueError(f"fourier is {self.fourier} and octaves {self.octaves}, expected 0 or more")
         edges = self.budgets
         if edges and (len(edges) < 2 or any(a >= b for a, b in pairwise(edges))):
             raise ValueError(f"budgets is {edges}, expected two or more rising edges")

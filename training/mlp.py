@@ -19,7 +19,7 @@ class BudgetedPerceptron(BudgetedPolicy):
         super().__init__(config, memory=0)
         layers: list[nn.Module] = []
         for i in range(config.n_layers):
-            layers += [nn.Linear(config.width if i else config.encoder_width, config.width), nn.GELU("tanh")]
+            layers += [nn.Linear(config.width if i else config.encoder_width, config.width), nn.ReLU()]
         self.layers = nn.Sequential(*layers)
 
     def hiddens(self, known: Known, query_BTM: Tensor) -> Tensor:

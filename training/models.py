@@ -82,7 +82,7 @@ class Block(nn.Module):
         self.norm_mlp = nn.LayerNorm(config.width)
         self.mlp = nn.Sequential(
             nn.Linear(config.width, 4 * config.width),
-            nn.GELU(approximate="tanh"),
+            nn.ReLU(),
             nn.Linear(4 * config.width, config.width),
         )
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 __all__ = ["BudgetedPolicy", "ModelConfig", "Normalisation"]
 
@@ -25,7 +24,7 @@ _COST_OCTAVES = 3
 class ModelConfig:
     """Sizes of one network."""
 
-    n_free: int  # F
+    octaves: tuple[int, ...]  # sine/cosine octaves of each of the F free numbers: positions must be told apart finely
     owner: tuple[int, ...]  # costly feature that each of the D costly numbers belongs to
     n_queries: int  # M
     bins: tuple[int, ...]  # bins of each action component, A of them
@@ -38,11 +37,15 @@ class ModelConfig:
     n_layers: int = 2  # L
     n_heads: int = 4  # H
     encoder_width: int = 128  # E, hidden width of the token encoder and of the acquisition head
-    fourier: int = 4  # sine/cosine octaves of each free number: positions must be told apart finely
     acquisition: str = "learned"  # learned | random | all | none: whether queries are learned, drawn, or forced
     acquisition_bias: float = 0.0  # initial logit of every query probability
     target_cost: float = 1.0  # C, where it is no input
     budget_conditioned: bool = False  # C is an input of the acquisition head
+
+    @property
+    def n_free(self) -> int:
+        """F."""
+        return len(self.octaves)
 
     @property
     def has_memory(self) -> bool:
@@ -91,7 +94,7 @@ class AcquisitionHead(nn.Module):
         """`prepared` [..., E] is `from_context` of what is known before the query."""
         if self.from_memory is not None:
             prepared = prepared + self.from_memory(memory)
-        return self.out(functional.gelu(prepared, approximate="tanh"))
+        return self.out(torch.relu(prepared))
 
 
 @dataclass(frozen=True)
@@ -116,13 +119,18 @@ class BudgetedPolicy(nn.Module):
     """π̂ and π̃; raw numbers in, probabilities and bin logits out."""
 
     owner: Tensor
+    wave_number: Tensor  # free number that each wave is of
+    wave_frequency: Tensor
 
     def __init__(self, config: ModelConfig, memory: int) -> None:
         """`memory`: numbers that the acquisition head reads of the past, 0 for none."""
         super().__init__()
         self.config, self.memory_width = config, memory
-        n_costly, n_context = len(config.owner), config.n_free * (1 + 2 * config.fourier) + 1
+        waves = [(i, math.pi / 2 * 2**k) for i, octaves in enumerate(config.octaves) for k in range(octaves)]
+        n_costly, n_context = len(config.owner), config.n_free + 2 * len(waves) + 1
         self.register_buffer("owner", torch.tensor(config.owner, dtype=torch.long))
+        self.register_buffer("wave_number", torch.tensor([i for i, _ in waves], dtype=torch.long))
+        self.register_buffer("wave_frequency", torch.tensor([frequency for _, frequency in waves]))
         self.normalise_free = Normalisation(config.n_free)
         self.normalise_costly = Normalisation(n_costly)
         self.normalise_return = Normalisation(1)
@@ -135,11 +143,10 @@ class BudgetedPolicy(nn.Module):
     def context(self, free: Tensor, returns_to_go: Tensor) -> Tensor:
         """Free features [..., F] with their Fourier octaves, and the return-to-go [..., 1]: known before the query."""
         z = self.normalise_free(free)
-        octaves = [z] + [
-            wave(z * (math.pi / 2) * 2**k) for k in range(self.config.fourier) for wave in (torch.sin, torch.cos)
-        ]
+        waves = z.index_select(-1, self.wave_number) * self.wave_frequency
         togo = self.normalise_return(returns_to_go)
-        return torch.cat([*octaves, togo if self.config.reads_returns else torch.zeros_like(togo)], dim=-1)
+        togo = togo if self.config.reads_returns else torch.zeros_like(togo)
+        return torch.cat([z, torch.sin(waves), torch.cos(waves), togo], dim=-1)
 
     def know(self, free: Tensor, returns_to_go: Tensor, target_cost: Tensor, costly: Tensor | None = None) -> Known:
         """All that does not depend on the query: free [..., F], returns_to_go [..., 1], target_cost C [..., 1], and
@@ -164,7 +171,7 @@ class BudgetedPolicy(nn.Module):
         """First hidden layer of W[q_t∘o_t, q_t, free_t, R_t], [..., E]; values not acquired cannot enter."""
         acquired = known.costly * query.index_select(-1, self.owner)
         mixed = known.token + self.encode_acquired(torch.cat([acquired, query], dim=-1))
-        return functional.gelu(mixed, approximate="tanh")
+        return torch.relu(mixed)
 
     def hiddens(self, known: Known, query_BTM: Tensor) -> Tensor:
         """The state that the action head reads at every timestep, [B, T, W]."""

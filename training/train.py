@@ -133,7 +133,7 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tens
         return delta + penalised
 
     sampled = rollout(model, known, query_BTM.requires_grad_())
-    backward(sampled, loss, config.sweeps if model.config.has_memory else 1)
+    backward(sampled, loss, config.sweeps if model.config.has_memory else 1, list(model.parameters()))
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, state.done)

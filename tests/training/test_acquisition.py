@@ -30,7 +30,7 @@ def network(
     """Random weights, with an acquisition head that depends strongly on the past."""
     torch.manual_seed(seed)
     config = ModelConfig(
-        n_free=F,
+        octaves=(1, 0, 2),
         owner=OWNER,
         n_queries=M,
         bins=(5, 2),
@@ -42,7 +42,6 @@ def network(
         n_layers=n_layers,
         n_heads=2,
         encoder_width=16,
-        fourier=1,
         acquisition=acquisition,
         target_cost=0.3,
         budget_conditioned=True,
@@ -144,7 +143,7 @@ def test_enough_sweeps_give_the_sequential_gradient(seed: int) -> None:
     model.zero_grad()
     query, _ = sample_queries(model, know(model, free, costly, togo), uniforms)
     sampled = rollout(model, know(model, free, costly, togo), query.requires_grad_())
-    assert backward(sampled, loss, sweeps=length).item() == pytest.approx(value.item(), rel=1e-5)
+    assert backward(sampled, loss, length, list(model.parameters())).item() == pytest.approx(value.item(), rel=1e-5)
     for name, gradient in gradients(model).items():
         assert torch.allclose(gradient, expected[name], rtol=1e-3, atol=1e-5), name
 
@@ -157,7 +156,7 @@ def test_penalty_moves_the_acquisition_path_only() -> None:
         model.zero_grad()
         query, _ = sample_queries(model, know(model, free, costly, togo), uniforms)
         sampled = rollout(model, know(model, free, costly, togo), query.requires_grad_())
-        backward(sampled, objective(model, bins, gamma), sweeps=2)
+        backward(sampled, objective(model, bins, gamma), 2, list(model.parameters()))
         return gradients(model)
 
     without, with_penalty = run(0.0), run(5.0)
@@ -176,7 +175,7 @@ def test_forced_acquisition(acquisition: str, value: float) -> None:
     assert (query == value).all()
     sampled = rollout(model, known, query.requires_grad_())
     assert (sampled.probs_BTM == value).all()
-    backward(sampled, objective(model, bins, 0.0), sweeps=2)
+    backward(sampled, objective(model, bins, 0.0), 2, list(model.parameters()))
     assert model.action_head.weight.grad is not None
 
 

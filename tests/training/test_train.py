@@ -122,7 +122,11 @@ def test_refuses_settings_that_cannot_be(dataset: Path, setting: str, value: obj
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"bins": (3,)}, "bins has 1 numbers"), ({"sampled": ("jmup",)}, "sampled names .'jmup'.")],
+    [
+        ({"bins": (3,)}, "bins has 1 numbers"),
+        ({"octaves": {"left": 2}}, "octaves names .'left'., the free features are .'which', 'clock'."),
+        ({"sampled": ("jmup",)}, "sampled names .'jmup'."),
+    ],
 )
 def test_refuses_settings_for_another_action(dataset: Path, settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
