@@ -48,7 +48,7 @@ def build_model(config: TrainConfig, traces: Traces) -> BudgetedPolicy:
             acquisition=config.acquisition,
             acquisition_bias=config.acquisition_bias,
             target_cost=config.budget,
-            budget_conditioned=bool(config.budgets),
+            cost_range=(config.budgets[0], config.budgets[-1]) if config.budgets else None,
         )
     )
     model.normalise_free.fit(*moments(traces.free_SF))

@@ -44,6 +44,7 @@ class ExportConfig:
 
     run: tyro.conf.Positional[Path]  # folder written by training.train
     out: tyro.conf.Positional[Path]  # folder of the bundle; replaced if it exists
+    name: str = ""  # of the bundle (empty: the run's)
     tolerance: float = 1e-4  # largest |Δ| between torch and ONNX that is accepted
 
 
@@ -133,7 +134,7 @@ def export(config: ExportConfig) -> Bundle:
         folder.mkdir()
         write_graphs(trained, folder)
         np.savez_compressed(folder / "golden.npz", **golden_episode(trained))
-        manifest = _manifest(trained, folder, config.tolerance)
+        manifest = _manifest(trained, folder, config)
         (folder / "manifest.json").write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
         bundle = Bundle.load(folder)
         for name in _COPIED:
@@ -145,7 +146,7 @@ def export(config: ExportConfig) -> Bundle:
     return bundle
 
 
-def _manifest(trained: Trained, folder: Path, tolerance: float) -> Manifest:
+def _manifest(trained: Trained, folder: Path, asked: ExportConfig) -> Manifest:
     config, facts, sizes = trained.config, trained.facts, trained.model.config
     files = {}
     for name in FILES:
@@ -153,7 +154,7 @@ def _manifest(trained: Trained, folder: Path, tolerance: float) -> Manifest:
         files[name] = FileEntry(sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
     return Manifest(
         schema_version=SCHEMA_VERSION,
-        name=config.name,
+        name=asked.name or config.name,
         method=config.method,
         features=facts.features,
         action=facts.action,
@@ -161,7 +162,7 @@ def _manifest(trained: Trained, folder: Path, tolerance: float) -> Manifest:
         target_cost=sizes.target_cost if sizes.budget_conditioned else None,
         **_context_sizes(sizes),
         budget=config.frame_budget,
-        tolerance=tolerance,
+        tolerance=asked.tolerance,
         files=files,
         provenance={
             "dataset": config.dataset.name,

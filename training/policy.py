@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 __all__ = ["BudgetedPolicy", "ModelConfig", "Normalisation"]
 
-_LEAST_COST = 1e-3  # shares of the full cost below this one are one and the same to the acquisition head
 _COST_OCTAVES = 3
 
 
@@ -40,7 +39,12 @@ class ModelConfig:
     acquisition: str = "learned"  # learned | random | all | none: whether queries are learned, drawn, or forced
     acquisition_bias: float = 0.0  # initial logit of every query probability
     target_cost: float = 1.0  # C, where it is no input
-    budget_conditioned: bool = False  # C is an input of the acquisition head
+    cost_range: tuple[float, float] | None = None  # where C is an input of the acquisition head: what it was drawn from
+
+    @property
+    def budget_conditioned(self) -> bool:
+        """Whether C is an input of the acquisition head."""
+        return self.cost_range is not None
 
     @property
     def n_free(self) -> int:
@@ -152,7 +156,8 @@ class BudgetedPolicy(nn.Module):
         """All that does not depend on the query: free [..., F], returns_to_go [..., 1], target_cost C [..., 1], and
         costly [..., D] (None where only the query is wanted)."""
         context = self.context(free, returns_to_go)
-        before = torch.cat([context, _cost_waves(target_cost)], -1) if self.config.budget_conditioned else context
+        limits = self.config.cost_range
+        before = context if limits is None else torch.cat([context, _cost_waves(target_cost, *limits)], -1)
         normalised = free[..., :0] if costly is None else self.normalise_costly(costly)
         return Known(self.acquisition_head.from_context(before), self.encode_context(context), normalised, target_cost)
 
@@ -199,8 +204,9 @@ class BudgetedPolicy(nn.Module):
         return torch.stack(chosen, dim=-1)
 
 
-def _cost_waves(target_cost: Tensor) -> Tensor:
-    """C on a logarithmic scale, 0 at a thousandth and 1 at all, with sines and cosines of it, [..., 7]."""
-    z = 1.0 + torch.log10(target_cost.clamp(_LEAST_COST, 1.0)) / -math.log10(_LEAST_COST)
+def _cost_waves(target_cost: Tensor, low: float, high: float) -> Tensor:
+    """C on a logarithmic scale, 0 to 1 over the range that was trained, with sines and cosines of it, [..., 7]. What
+    lies outside is taken for the nearer end: no network knows what it was never asked."""
+    z = torch.log(target_cost.clamp(low, high) / low) / math.log(high / low)
     waves = [wave(z * math.pi * 2**k) for k in range(_COST_OCTAVES) for wave in (torch.sin, torch.cos)]
     return torch.cat([z, *waves], dim=-1)

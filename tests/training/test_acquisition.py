@@ -44,7 +44,7 @@ def network(
         encoder_width=16,
         acquisition=acquisition,
         target_cost=0.3,
-        budget_conditioned=True,
+        cost_range=(0.01, 1.0),
     )
     model = BudgetedDecisionTransformer(config)
     torch.nn.init.normal_(model.acquisition_head.out.weight, std=spread)

@@ -114,8 +114,8 @@ def test_every_method_exports_to_a_bundle_that_verifies(
     """`export` loads what it wrote with the runtime's loader, which replays the golden episode."""
     settings = {"method": method, "acquisition": acquisition, "budgets": (0.05, 0.3, 1.0), "budget": 0.25}
     train(toy.config(dataset, tmp_path / "run", updates=3, log_every=1, **settings))
-    manifest = export(ExportConfig(tmp_path / "run", tmp_path / "bundle")).manifest
-    assert (manifest.method, manifest.target_cost) == (method, 0.25)
+    manifest = export(ExportConfig(tmp_path / "run", tmp_path / "bundle", name="other")).manifest
+    assert (manifest.name, manifest.method, manifest.target_cost) == ("other", method, 0.25)
     assert manifest.context_length == (5 if method == "bdt" else 1)
     assert manifest.provenance["trained_budget"] == "conditioned"
 

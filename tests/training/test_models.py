@@ -101,3 +101,15 @@ def test_the_target_cost_moves_the_query_and_nothing_else() -> None:
     assert torch.equal(hidden, model.hiddens(much, query))
     memory = model.memory(hidden)
     assert not torch.allclose(model.query_probs(memory, little), model.query_probs(memory, much), atol=1e-3)
+
+
+def test_a_target_cost_outside_what_was_trained_is_the_nearest_that_was() -> None:
+    model = network(5)
+    free, costly, togo, _, _ = batch(5, 1, 3)
+    memory = torch.zeros(1, 3, 8)
+
+    def asked(c: float) -> torch.Tensor:
+        return model.query_probs(memory, model.know(free, togo, torch.full_like(togo, c), costly))
+
+    assert torch.equal(asked(0.0), asked(0.01))
+    assert not torch.allclose(asked(0.02), asked(0.01), atol=1e-4)
