@@ -2,9 +2,11 @@
 
 Two controls. *algorithm-1* is the paper's: the penalty φ of Eq. 2 counts what single frames spend above C, and γ rises
 by ε after every batch with φ > 0; it never falls. Queries are Bernoulli samples, so some frame of a batch is always
-above C: γ rises for ever and the budget ends up unspent. *dual* is a Lagrangian: the constraint is on the mean cost,
-and log γ moves up by ε times the relative excess of that mean over C and down by its relative slack, which settles
-where the budget is spent (multiplicative weights; a step is at most ε, so one batch cannot throw it).
+above C: γ rises for ever and the budget ends up unspent. *dual* is a Lagrangian: the mean cost shall be C, and γ moves
+up with the relative excess of that mean over C and down with its relative slack, which settles where the budget is
+spent. It moves in asinh(γ), by at most ε a batch: by equal factors where γ is large, and through zero where it is not.
+A γ below zero pays for asking. That is what makes a network find out what it could do with a larger budget: its
+acquisition head serves small ones too, and an action head that has never seen a feature does not miss it.
 
 Where the budget is an input, C is drawn from strata and each stratum has a γ of its own: what a feature must be worth
 to be acquired differs by orders of magnitude between C = 0.5 and C = 0.01. This module knows nothing about networks.
@@ -25,7 +27,8 @@ from training.objectives import penalty
 __all__ = ["Control", "draw_costs"]
 
 _FIRST_WEIGHT = 0.05  # of the dual control: features are nearly free at first, so that their worth is seen
-_LEAST_WEIGHT, _MOST_WEIGHT = 1e-3, 1e3
+_LEAST_WEIGHT, _MOST_WEIGHT = -0.1, 1e3
+_LINEAR = 0.02  # below it γ moves in equal steps, above it by equal factors
 _LEAST_COST = 1e-3  # the relative excess over C = 0 is taken over this share
 
 
@@ -75,5 +78,5 @@ class Control:
                 continue
             spent, allowed = (cost * valid).sum().item(), (target * valid).sum().item()
             excess = (spent - allowed) / max(allowed, _LEAST_COST * valid.sum().item())
-            moved = self.weights[i] * math.exp(self.step * min(max(excess, -1.0), 1.0))
-            self.weights[i] = min(max(moved, _LEAST_WEIGHT), _MOST_WEIGHT)
+            moved = math.asinh(self.weights[i] / _LINEAR) + self.step * min(max(excess, -1.0), 1.0)
+            self.weights[i] = min(max(_LINEAR * math.sinh(moved), _LEAST_WEIGHT), _MOST_WEIGHT)

@@ -43,9 +43,16 @@ def test_dual_moves_towards_the_constraint_by_a_bounded_step(cost: float, budget
     control = Control.of("dual", step, 1)
     before = control.weights[0]
     control.observe(torch.full((1, 1), cost), torch.tensor([budget]), ONLY, ONES)
-    moved = np.log(control.weights[0] / before)
+    moved = np.arcsinh(control.weights[0] / 0.02) - np.arcsinh(before / 0.02)
     assert abs(moved) <= step + 1e-9
     assert moved == pytest.approx(0.0, abs=1e-9) or (moved > 0) == (cost > budget)
+
+
+def test_dual_pays_for_asking_where_a_budget_is_left_over() -> None:
+    control = Control.of("dual", 0.01, 1)
+    for _ in range(1000):
+        control.observe(torch.zeros(1, 1), torch.tensor([0.4]), ONLY, ONES)
+    assert control.weights[0] == pytest.approx(-0.1)
 
 
 def test_each_stratum_has_its_own_weight_and_padding_is_not_spent() -> None:
