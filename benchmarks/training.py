@@ -43,7 +43,7 @@ __all__ = ["Training", "main", "measure"]
 
 @dataclass(frozen=True)
 class Training:
-    """Time an update: batch, queries, forward, backward. The optimiser's step is the same for all and left out."""
+    """Time an update: queries, forward, backward. Batch and optimiser's step are the same for all and left out."""
 
     batch: int = 40  # windows
     window: int = 60  # timesteps
@@ -51,7 +51,7 @@ class Training:
     threads: int = 1
     device: str = "cpu"  # as torch names it
     seed: int = 0
-    profile: bool = False  # print the profile of the fastest way as well
+    profile: bool = False  # print the profile of the incremental way as well
     json: bool = False  # print one JSON line instead of a table
 
 
@@ -109,8 +109,9 @@ def measure(asked: Training) -> dict[str, float]:
     config = TrainConfig(
         Path(), Path(), "benchmark", bins=(11, 6, 2), batch=asked.batch, window=asked.window, device=asked.device
     )
-    traces = _traces(20_000, asked.seed).to(asked.device)
+    traces = _traces(20_000, asked.seed)
     state = new_state(config, traces)
+    traces = traces.to(asked.device)
     torch.nn.init.normal_(state.model.acquisition_head.out.weight, std=0.5)
     costs_M = torch.tensor(traces.features.costs_us, dtype=torch.float32, device=asked.device)
     ways, seconds, differing = _ways(config, state, costs_M), {}, 0
@@ -137,7 +138,8 @@ def measure(asked: Training) -> dict[str, float]:
 
 
 def _print_profile(run: Callable[[], object]) -> None:
-    with profile(activities=[ProfilerActivity.CPU]) as profiler:
+    devices = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if torch.cuda.is_available() else [])]
+    with profile(activities=devices) as profiler:
         run()
     print(profiler.key_averages().table(sort_by="self_cpu_time_total", row_limit=15, max_name_column_width=40))
 

@@ -90,7 +90,7 @@ def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainS
 
 def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
     """Continue a run: its settings must be those it began with, but for how long it goes on. Raises ValueError."""
-    data = torch.load(path, weights_only=True, map_location=config.device)
+    data = torch.load(path, weights_only=True, map_location="cpu")
     theirs, ours = _decode_config(data["config"]), config
     for name, value in asdict(ours).items():
         if name not in ("out", "updates", "log_every", "checkpoint_every") and getattr(theirs, name) != value:

@@ -35,6 +35,7 @@ Line = Mapping[str, float]  # of metrics.jsonl
 PANELS = ("delta", "cost", "phi", "gamma")
 _TITLES = {"delta": "action loss Δ", "cost": "query cost, share of full", "phi": "penalty φ", "gamma": "weight γ"}
 _STRATUM_COST = "query cost / C"
+_LINEAR_WEIGHT = 0.02  # as training.control has it
 _LINEAR_BELOW = 1e-3  # share of the full cost: a logarithm has no 0
 
 
@@ -98,7 +99,7 @@ def finish_panels(axes: Mapping[str, Axes], configs: Sequence[TrainConfig]) -> N
         each.set_xlabel("update")
         each.grid(alpha=0.3)
     if config.control == "dual":
-        axes["gamma"].set_yscale("log")  # it moves by factors
+        axes["gamma"].set_yscale("symlog", linthresh=_LINEAR_WEIGHT)  # it moves by factors, and may pass zero
     if config.budgets:
         axes["cost"].axhline(1.0, linestyle="--", linewidth=1, color="grey")
         axes["cost"].set_yscale("log")  # from a hundred times C to C

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-__all__ = ["BudgetedPolicy", "ModelConfig", "Normalisation"]
+__all__ = ["BudgetedPolicy", "Known", "ModelConfig"]
 
 _COST_OCTAVES = 3
 

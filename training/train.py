@@ -30,7 +30,7 @@ from training.policy import BudgetedPolicy, Known
 from training.record import RunRecord, write_versions
 from training.traces import Batch, Traces, draw_windows, load_traces
 
-__all__ = ["TrainState", "main", "new_state", "train", "update"]
+__all__ = ["Drawn", "TrainState", "draw", "know", "main", "new_state", "train", "update"]
 
 _CRITIC_RATE = 3e-4
 
@@ -84,6 +84,8 @@ def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator) -> Dr
     batch = draw_windows(traces, config.batch, config.window, chance)
     shape = (*batch.valid_BT.shape, traces.features.n_queries)
     uniforms = torch.from_numpy(chance.random(shape, dtype=np.float32)).to(config.device)
+    # Past an episode's end nothing is asked for, so that padding takes nothing of a budget that windows share.
+    uniforms = torch.where(batch.valid_BT[..., None] > 0.0, uniforms, 1.0)
     together = config.frame_bots if config.allocation == "frame" else 1
     targets, strata = np.full(config.batch, config.budget, np.float32), np.zeros(config.batch, np.int64)
     if config.budgets:
@@ -122,13 +124,18 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tens
     query_BTM, passes = sample(config, model, known, drawn, costs_M)
     weight_BT = _critics_update(state, batch)
     parts: dict[str, float] = {}
+    costs: list[Tensor] = []
 
     def loss(sampled: Rollout) -> Tensor:
         delta = _delta(model, sampled, batch, weight_BT)
-        penalised, phi = control.penalty(
-            query_cost(sampled.query_BTM, costs_M), drawn.target_B, drawn.stratum_B, valid_BT
-        )
+        # What is asked for counts, and not what allocation left of it: the network must learn to ask for what it may
+        # have. The gradient is that of the query.
+        asked_BTM = (drawn.uniforms_BTM < sampled.probs_BTM).to(costs_M.dtype)
+        asked_BTM = sampled.query_BTM + (asked_BTM - sampled.query_BTM).detach()
+        cost_BT = query_cost(asked_BTM, costs_M)
+        penalised, phi = control.penalty(cost_BT, drawn.target_B, drawn.stratum_B, valid_BT)
         parts.update(delta=delta.item(), phi=phi.item())
+        costs.append(cost_BT.detach())
         # γφ depends on the queries alone, so it moves the acquisition path and leaves the action head as it is.
         return delta + penalised
 
@@ -138,12 +145,10 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tens
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, state.done)
     state.optimiser.step()
-    # What is asked for, and not what allocation left of it: the network must learn to ask for what it may have.
-    asked_BT = query_cost((drawn.uniforms_BTM < sampled.probs_BTM).to(costs_M.dtype), costs_M).detach()
     if config.acquisition == "learned":
-        control.observe(asked_BT, drawn.target_B, drawn.stratum_B, valid_BT)
+        control.observe(costs[0], drawn.target_B, drawn.stratum_B, valid_BT)
     state.done += 1
-    spent = _spent(config, asked_BT, drawn) | {"passes": float(passes), "gradient_norm": float(norm)}
+    spent = _spent(config, costs[0], drawn) | {"passes": float(passes), "gradient_norm": float(norm)}
     state.metrics = parts | spent | _weights(control)
 
 

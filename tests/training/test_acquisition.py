@@ -130,18 +130,20 @@ def gradients(model: BudgetedDecisionTransformer) -> dict[str, torch.Tensor]:
     return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
 
 
+@pytest.mark.parametrize("allocated", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_enough_sweeps_give_the_sequential_gradient(seed: int) -> None:
+def test_enough_sweeps_give_the_sequential_gradient(seed: int, allocated: bool) -> None:
     length = 7
     model = network(seed)
     free, costly, togo, uniforms, bins = batch(seed, 2, length)
     loss = objective(model, bins, gamma=0.7)
-    reference = sample_queries_sequentially(model, know(model, free, costly, togo), uniforms)
+    fit = fit_frames(COSTS, torch.tensor([0.2, 0.4]), 2) if allocated else None
+    reference = sample_queries_sequentially(model, know(model, free, costly, togo), uniforms, fit)
     value = loss(reference)
     value.backward()
     expected = gradients(model)
     model.zero_grad()
-    query, _ = sample_queries(model, know(model, free, costly, togo), uniforms)
+    query, _ = sample_queries(model, know(model, free, costly, togo), uniforms, fit)
     sampled = rollout(model, know(model, free, costly, togo), query.requires_grad_())
     assert backward(sampled, loss, length, list(model.parameters())).item() == pytest.approx(value.item(), rel=1e-5)
     for name, gradient in gradients(model).items():

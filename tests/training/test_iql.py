@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from training.iql import Critics
@@ -16,6 +17,20 @@ def chain(length: int) -> tuple[torch.Tensor, ...]:
     last = torch.zeros(2, length)
     last[:, -1] = 1.0
     return state, action, togo, last, torch.ones(2, length)
+
+
+def test_values_are_what_is_left_to_earn() -> None:
+    torch.manual_seed(0)
+    state, action, togo, last, valid = (part[1:] if len(part) == 2 else part for part in chain(4))
+    critics = Critics(4, 1, reward_scale=2.0)
+    optimiser = torch.optim.Adam([p for p in critics.parameters() if p.requires_grad], lr=3e-3)
+    for _ in range(800):
+        optimiser.zero_grad()
+        critics.loss(state, action, togo, last, valid).backward()
+        optimiser.step()
+        critics.follow()
+    expected = [sum(0.99**k for k in range(n)) / 2.0 for n in (4, 3, 2, 1)]
+    assert critics.value(state)[0, :, 0].tolist() == pytest.approx(expected, abs=0.03)
 
 
 def test_values_and_weights_favour_the_action_that_earns() -> None:

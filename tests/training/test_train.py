@@ -61,6 +61,39 @@ def test_a_stopped_run_resumes_to_the_same_weights(dataset: Path, tmp_path: Path
         assert torch.equal(value, resumed.model.state_dict()[name]), name
 
 
+@pytest.mark.parametrize("allocation", ["none", "bot", "frame"])
+def test_both_samplers_train_the_same_network(dataset: Path, tmp_path: Path, allocation: str) -> None:
+    settings = {"allocation": allocation, "frame_bots": 4, "budgets": (0.05, 1.0), "control": "dual", "updates": 8}
+    one, other = (
+        train(toy.config(dataset, tmp_path / name, sampler=name, **settings)) for name in ("incremental", "parallel")
+    )
+    for name, value in one.model.state_dict().items():
+        assert torch.allclose(value, other.model.state_dict()[name], atol=1e-4), name
+
+
+def test_what_allocation_took_away_is_penalised_too(dataset: Path, tmp_path: Path) -> None:
+    """Each query fits C, but what was asked for did not: φ counts it, and moves the acquisition head."""
+    heads = []
+    for step in (0.0, 10.0):
+        settings = {"allocation": "bot", "budget": 0.2, "penalty_step": step, "updates": 10, "log_every": 10}
+        state = train(toy.config(dataset, tmp_path / str(step), **settings))
+        assert json.loads((tmp_path / str(step) / "metrics.jsonl").read_text())["phi"] > 0.0
+        heads.append(state.model.acquisition_head.out.bias.detach().mean().item())
+    assert heads[1] < heads[0]
+
+
+def test_a_conditioned_network_asks_for_more_where_it_may(dataset: Path, tmp_path: Path) -> None:
+    settings = {"budgets": (0.02, 0.1, 0.9), "control": "dual", "penalty_step": 0.05, "learning_rate": 5e-3}
+    state = train(toy.config(dataset, tmp_path, method="rcbc", updates=500, log_every=500, **settings))
+    free, togo = torch.tensor([[0.0, 5.0], [1.0, 5.0]]), torch.full((2, 1), 5.0)
+    with torch.no_grad():
+        asked = [
+            state.model.query_probs(torch.zeros(2, 0), state.model.know(free, togo, torch.full((2, 1), c))).mean()
+            for c in (0.02, 0.9)
+        ]
+    assert asked[1] > 1.2 * asked[0]
+
+
 def train_interrupted(config: TrainConfig, after: int) -> None:
     """Ctrl-C in the middle of a run."""
     import training.train as room
@@ -112,6 +145,7 @@ def test_refuses_to_resume_with_other_settings(dataset: Path, tmp_path: Path) ->
         ("budgets", (0.1,), "two or more rising edges"),
         ("budgets", (0.5, 0.1), "two or more rising edges"),
         ("budgets", (0.0, 0.1), "shares above 0"),
+        ("budgets", (0.2, 0.9), "budget is 0.1, expected within what is trained"),
         ("allocation", "frame", "not a multiple of frame_bots"),
     ],
 )
