@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -26,8 +27,10 @@ def test_verifies_and_is_made_for_this_game(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["easy", "hard"])
 def test_was_made_by_the_configuration_that_we_ship(name: str) -> None:
+    """But for the folder and the name of the run: the bundles are runs of the sweep."""
     shipped = TrainConfig.read(BUNDLES.parent / "training" / "configs" / f"{name}.json")
-    assert TrainConfig.read(BUNDLES / name / "config.json") == shipped
+    made_by = TrainConfig.read(BUNDLES / name / "config.json")
+    assert dataclasses.replace(made_by, out=shipped.out, name=shipped.name) == shipped
 
 
 @pytest.mark.parametrize("name", ["easy", "hard"])
