@@ -22,6 +22,7 @@ __all__ = ["MAX_PASSES", "allocate"]
 # (Higham, Accuracy and Stability, 2002, eq. 4.4), here and again at the caller's; eight eps a term is ample for both.
 _MARGIN_PER_TERM = 8.0 * np.finfo(np.float64).eps
 _NOTHING_FITS = -1.0
+_LEAST_DENSITY = -np.finfo(np.float64).max
 # Each pass drops at least every feature of one cost, and a cost table has few distinct costs; a table of a thousand
 # different ones may end early, which only leaves budget unspent.
 MAX_PASSES = 64
@@ -120,6 +121,7 @@ def _greedy(items: _Items, limits_R: _Floats) -> _Bools:
     can no longer fit: the first item after the run at least.
     """
     density_RI = np.where(items.costs_RI > 0.0, items.value_RI / items.costs_RI, np.inf)
+    density_RI = np.maximum(density_RI, _LEAST_DENSITY)  # minus infinity would sort with what was not asked for
     order_RI = np.argsort(np.where(items.asked_RI, -density_RI, np.inf), axis=1, kind="stable")
     order_RI = order_RI[:, : items.asked_RI.sum(axis=1).max()]  # what was not asked for sorts last
     order_RI += np.arange(len(order_RI))[:, None] * items.asked_RI.shape[1]  # as places of the flattened arrays

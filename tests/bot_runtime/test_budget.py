@@ -111,6 +111,14 @@ def test_maximal(case: tuple) -> None:
             assert not float(true_cost(more, costs, call)) <= tight[row]
 
 
+def test_what_is_worth_least_of_all_is_still_asked_for_where_it_fits() -> None:
+    """A network may give anything for a probability; a density of minus infinity is not the lack of one."""
+    sampled = np.array([[False, False, True, True]])
+    probs = np.array([[0.0, 0.0, 0.5, -1e8]])
+    costs = np.array([1.0, 1.0, 0.2, 1e-301])
+    assert allocate(probs, sampled, costs, 0.0, 0.1).tolist() == [[False, False, False, True]]
+
+
 def sequential_greedy(
     probs: np.ndarray, sampled: np.ndarray, costs: np.ndarray, call: float, limit: float
 ) -> np.ndarray:
