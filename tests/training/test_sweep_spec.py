@@ -140,7 +140,7 @@ BLOCKS = st.fixed_dictionaries(
         "budgets": st.sampled_from([[], [0.01, 0.5]]),
         "control": st.lists(st.sampled_from(["algorithm-1", "dual"]), min_size=1, unique=True),
         "seed": st.lists(st.integers(0, 99), min_size=1, max_size=4, unique=True),
-        "penalty_step": st.lists(st.sampled_from([1e-4, 0.5, 3.0]), min_size=1, unique=True),
+        "penalty_step": st.lists(st.sampled_from([0.5, 2.0, 3.0]), min_size=1, unique=True),
     },
 )
 
