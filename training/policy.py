@@ -9,6 +9,7 @@ components; `...` any leading axes.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -119,7 +120,7 @@ class Known:
         return Known(self.acquisition[index_B], self.token[index_B], self.costly[index_B], self.target_cost[index_B])
 
 
-class BudgetedPolicy(nn.Module):
+class BudgetedPolicy(nn.Module, ABC):
     """π̂ and π̃; raw numbers in, probabilities and bin logits out."""
 
     owner: Tensor
@@ -178,13 +179,13 @@ class BudgetedPolicy(nn.Module):
         mixed = known.token + self.encode_acquired(torch.cat([acquired, query], dim=-1))
         return torch.relu(mixed)
 
+    @abstractmethod
     def hiddens(self, known: Known, query_BTM: Tensor) -> Tensor:
         """The state that the action head reads at every timestep, [B, T, W]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def memory(self, hidden_BTW: Tensor) -> Tensor:
         """What the acquisition head reads of the past at every timestep, [B, T, memory]."""
-        raise NotImplementedError
 
     def action_logits(self, hidden: Tensor) -> list[Tensor]:
         """Logits over the bins of each action component: A tensors [..., bins]."""

@@ -19,33 +19,31 @@ def chain(length: int) -> tuple[torch.Tensor, ...]:
     return state, action, togo, last, torch.ones(2, length)
 
 
-def test_values_are_what_is_left_to_earn() -> None:
-    torch.manual_seed(0)
-    state, action, togo, last, valid = (part[1:] if len(part) == 2 else part for part in chain(4))
-    critics = Critics(4, 1, reward_scale=2.0)
+def fitted(critics: Critics, episodes: tuple[torch.Tensor, ...], updates: int) -> Critics:
     optimiser = torch.optim.Adam([p for p in critics.parameters() if p.requires_grad], lr=3e-3)
-    for _ in range(800):
+    for _ in range(updates):
         optimiser.zero_grad()
-        critics.loss(state, action, togo, last, valid).backward()
+        critics.loss(*episodes).backward()
         optimiser.step()
         critics.follow()
+    return critics
+
+
+def test_values_are_what_is_left_to_earn() -> None:
+    torch.manual_seed(0)
+    earning = tuple(part[1:] if len(part) == 2 else part for part in chain(4))
+    critics = fitted(Critics(4, 1, reward_scale=2.0), earning, 800)
     expected = [sum(0.99**k for k in range(n)) / 2.0 for n in (4, 3, 2, 1)]
-    assert critics.value(state)[0, :, 0].tolist() == pytest.approx(expected, abs=0.03)
+    assert critics.value(earning[0])[0, :, 0].tolist() == pytest.approx(expected, abs=0.03)
 
 
 def test_values_and_weights_favour_the_action_that_earns() -> None:
     torch.manual_seed(0)
-    state, action, togo, last, valid = chain(4)
-    critics = Critics(4, 1, reward_scale=1.0)
-    optimiser = torch.optim.Adam([p for p in critics.parameters() if p.requires_grad], lr=3e-3)
-    for _ in range(600):
-        optimiser.zero_grad()
-        critics.loss(state, action, togo, last, valid).backward()
-        optimiser.step()
-        critics.follow()
-    value = critics.value(state)[0, :, 0]
+    episodes = chain(4)
+    critics = fitted(Critics(4, 1, reward_scale=1.0), episodes, 600)
+    value = critics.value(episodes[0])[0, :, 0]
     assert (value[:-1] > value[1:]).all(), "more is left to earn earlier in the chain"
-    weights = critics.weights(state, action)
+    weights = critics.weights(episodes[0], episodes[1])
     assert (weights[1] > 3 * weights[0]).all()
     assert (weights <= 100.0).all()
 
