@@ -25,8 +25,10 @@ def make_policy(config: ModelConfig) -> BudgetedPolicy:
 def build_model(config: TrainConfig, traces: Traces) -> BudgetedPolicy:
     """A network for these traces, normalised by them. Raises ValueError where the action layout is another."""
     components = traces.action.components
-    if len(config.bins) != len(components):
+    if config.bins and len(config.bins) != len(components):
         raise ValueError(f"bins has {len(config.bins)} numbers, the action has {len(components)} components")
+    if traces.choices is not None and config.bins != (traces.choices,):
+        raise ValueError(f"bins is {config.bins}, expected ({traces.choices},): the action is one of so many choices")
     names = [component.name for component in components]
     if unknown := set(config.sampled) - set(names):
         raise ValueError(f"sampled names {sorted(unknown)}, the action has {names}")
@@ -71,4 +73,4 @@ def build_critics(model: BudgetedPolicy) -> Critics | None:
         return None
     context = model.encode_context.in_features
     scale = float(model.normalise_return.scale) / _RETURN_DEVIATION
-    return Critics(context + len(model.config.owner), len(model.config.bins), scale)
+    return Critics(context + len(model.config.owner), model.config.n_actions, scale)

@@ -17,6 +17,7 @@ import torch
 from protocol.features import ActionSpec, FeatureTable
 from training.build import make_policy
 from training.config import TrainConfig
+from training.feature_map import FeatureMap
 from training.policy import BudgetedPolicy, ModelConfig
 from training.traces import Traces
 
@@ -37,9 +38,10 @@ class Facts:
     action: ActionSpec
     target_return: float
     golden: dict[str, torch.Tensor]  # free [T, F], costly [T, D], rewards [T] of one recorded episode
+    feature_map: FeatureMap | None = None  # None: the environment itself tells free from costly
 
     @classmethod
-    def of(cls, traces: Traces, target_return: float | None) -> Facts:
+    def of(cls, traces: Traces, target_return: float | None, feature_map: FeatureMap | None = None) -> Facts:
         """The facts of these traces; `target_return` None takes the 90th percentile of their returns."""
         episode = int(traces.lengths_E[:_GOLDEN_CANDIDATES].argmax())
         start = int(traces.starts_E[episode])
@@ -53,7 +55,7 @@ class Facts:
         }
         if target_return is None:
             target_return = float(np.percentile(traces.episode_returns_E, 90))
-        return cls(traces.features, traces.action, target_return, golden)
+        return cls(traces.features, traces.action, target_return, golden, feature_map)
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainS
         "model_config": msgspec.json.encode(state.model.config).decode(),
         "features": msgspec.json.encode(facts.features).decode(),
         "action": msgspec.json.encode(facts.action).decode(),
+        "feature_map": msgspec.json.encode(facts.feature_map).decode(),
         "target_return": facts.target_return,
         "golden": facts.golden,
         "model": state.model.state_dict(),
@@ -121,6 +124,8 @@ def load_trained(path: Path) -> Trained:
         msgspec.json.decode(data["action"], type=ActionSpec),
         data["target_return"],
         data["golden"],
+        # Runs from before feature maps have none.
+        msgspec.json.decode(data.get("feature_map", "null"), type=FeatureMap | None),
     )
     return Trained(_decode_config(data["config"]), facts, model, data["done"])
 

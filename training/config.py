@@ -23,9 +23,12 @@ class TrainConfig:
     dataset: Path  # Minari dataset folder, such as data/navigation/navigation/hard-expert-v0
     out: Path  # folder of the run: config, checkpoint, metrics and curves
     name: str  # name of the bundle made from this run
+    more_datasets: tuple[Path, ...] = ()  # read with it, an episode of each in turn
+    feature_map: Path | None = None  # what the observations' numbers are (None: the dataset itself tells)
     environment: str = ""  # gymnasium id that evaluation plays, such as game.env:Navigation-hard-v0
+    reference_returns: tuple[float, float] | None = None  # returns that are 0 and 100 when normalised (D4RL's scores)
     seed: int = 0
-    episodes: int | None = None  # read only the first so many episodes (None: all)
+    episodes: int | None = None  # read only the first so many episodes of each dataset (None: all)
     held_out: float = 0.04  # share of the episodes, the last ones, that only measure the loss
 
     method: Literal["bdt", "rcbc", "bc", "iql"] = "bdt"
@@ -42,7 +45,7 @@ class TrainConfig:
     frame_budget: float = 0.2  # hard cap of one bot's query at run time, unless the engine sets another (bursts pass C)
     target_return: float | None = None  # return asked for at run time (None: 90th percentile of the traces)
 
-    bins: tuple[int, ...] = (11, 3, 2)  # bins of each action component
+    bins: tuple[int, ...] = (11, 3, 2)  # bins of each action component; none: each is Gaussian, and its mean is played
     sampled: tuple[str, ...] = ()  # action components sampled from their bins instead of taking the most probable
 
     context_length: int = 20  # K
@@ -72,10 +75,14 @@ class TrainConfig:
         for name in _COUNTS:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 1 or more")
+        if self.reference_returns is not None and not self.reference_returns[0] < self.reference_returns[1]:
+            raise ValueError(f"reference_returns is {self.reference_returns}, expected the lower one first")
         if self.held_out == 1.0:
             raise ValueError("held_out is 1.0, expected a share that leaves episodes to train on")
-        if min(self.bins, default=0) < 2:
-            raise ValueError(f"bins is {self.bins}, expected 2 or more for each action component")
+        if min(self.bins, default=2) < 2:
+            raise ValueError(f"bins is {self.bins}, expected 2 or more for each action component, or none at all")
+        if self.sampled and not self.bins:
+            raise ValueError(f"sampled is {self.sampled}, expected none: only bins can be sampled")
         if self.width % self.n_heads:
             raise ValueError(f"width {self.width} is not a multiple of n_heads {self.n_heads}")
         if min((self.fourier, *self.octaves.values())) < 0:
@@ -91,6 +98,11 @@ class TrainConfig:
             raise ValueError(f"batch {self.batch} is not a multiple of frame_bots {self.frame_bots}")
         if self.context_length < 2:
             raise ValueError(f"context_length is {self.context_length}, expected 2 or more")
+
+    @property
+    def dataset_name(self) -> str:
+        """`hopper-expert-v0`, or `hopper-expert-v0+hopper-medium-v0` where several are read."""
+        return "+".join(path.name for path in (self.dataset, *self.more_datasets))
 
     @classmethod
     def read(cls, path: Path) -> TrainConfig:

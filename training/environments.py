@@ -1,8 +1,8 @@
 """One environment as evaluation plays it: only what was asked for is looked at and, where possible, paid for.
 
-Any gymnasium environment whose observation is {"free": [F], "costly": [D]} will do. One that also offers the four
-calls of `Paying` acquires nothing but what is asked of it, which saves most of its time at a small budget. This module
-knows nothing about bundles, bots or budgets.
+Any gymnasium environment will do whose observation is {"free": [F], "costly": [D]}, or that a feature map makes so. One
+that also offers the four calls of `Paying` acquires nothing but what is asked of it, which saves most of its time at a
+small budget. This module knows nothing about bundles, bots or budgets.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
+
+from training.feature_map import FeatureMap, parts_of
 
 __all__ = ["Environment", "Outcome", "Paying", "open_environment"]
 
@@ -60,9 +62,11 @@ class Paying(Protocol):
         """`step` without acquiring anything."""
 
 
-def open_environment(name: str, owner_D: NDArray[np.int64]) -> Environment:
+def open_environment(name: str, owner_D: NDArray[np.int64], feature_map: FeatureMap | None = None) -> Environment:
     """Make the environment with this gymnasium id; `owner_D` says which costly feature each costly number is of."""
     env = gymnasium.make(name)
+    if feature_map is not None:
+        return _Mapped(env, owner_D, feature_map)
     bare = env.unwrapped
     # A time limit is a wrapper's: going around it would play longer episodes.
     if isinstance(bare, Paying) and env.spec is not None and env.spec.max_episode_steps is None:
@@ -89,12 +93,12 @@ class _Paid:
 class _Whole:
     """Observes everything each step, and hands on what is asked for."""
 
-    def __init__(self, env: gymnasium.Env[dict[str, _Floats], _Floats], owner_D: NDArray[np.int64]) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], owner_D: NDArray[np.int64]) -> None:
         self._env, self._owner_D = env, owner_D
         self._observation: dict[str, _Floats] = {}
 
     def restart(self, seed: int) -> None:
-        self._observation, _ = self._env.reset(seed=seed)
+        self._observation = self._split(self._env.reset(seed=seed)[0])
 
     def free(self) -> _Floats:
         return self._observation["free"]
@@ -103,5 +107,35 @@ class _Whole:
         return np.where(query_M[self._owner_D], self._observation["costly"], np.float32(0.0))
 
     def advance(self, action_A: _Floats) -> Outcome:
-        self._observation, reward, terminated, truncated, _ = self._env.step(action_A)
+        observation, reward, terminated, truncated, _ = self._env.step(self._action(action_A))
+        self._observation = self._split(observation)
         return Outcome(float(reward), bool(terminated), bool(truncated))
+
+    def _split(self, observation: Any) -> dict[str, _Floats]:
+        return observation
+
+    def _action(self, action_A: _Floats) -> Any:
+        return action_A
+
+
+class _Mapped(_Whole):
+    """An environment with an observation of its own, in which a feature map finds the features."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], owner_D: NDArray[np.int64], feature_map: FeatureMap) -> None:
+        super().__init__(env, owner_D)
+        self._map, self._chance = feature_map, np.random.default_rng()
+        self._is_choice = isinstance(env.action_space, gymnasium.spaces.Discrete)
+
+    def restart(self, seed: int) -> None:
+        self._chance = np.random.default_rng(seed)  # of the noise, before the first observation
+        super().restart(seed)
+
+    def _split(self, observation: Any) -> dict[str, _Floats]:
+        alone = (
+            {key: part[None] for key, part in observation.items()} if isinstance(observation, dict) else [observation]
+        )
+        free_1F, costly_1D = self._map.split(parts_of(alone, 1), self._chance)
+        return {"free": free_1F[0], "costly": costly_1D[0]}
+
+    def _action(self, action_A: _Floats) -> Any:
+        return round(float(action_A[0])) if self._is_choice else action_A

@@ -28,7 +28,9 @@ from bot_runtime.manifest import FILES, SCHEMA_VERSION, FileEntry, Manifest
 from bot_runtime.noise import uniforms
 from training.acquisition import rollout, sample_queries
 from training.checkpoint import Trained, load_trained
+from training.config import TrainConfig
 from training.curves import plot_curves
+from training.feature_map import FEATURE_MAP
 from training.graphs import AcquisitionGraph, ActionGraph, FrameActionGraph, example_inputs
 from training.models import BudgetedDecisionTransformer
 from training.policy import ModelConfig
@@ -101,7 +103,7 @@ def golden_episode(trained: Trained, seed: int = 0) -> dict[str, np.ndarray]:
     model, facts = trained.model, trained.facts
     free, costly, rewards = (facts.golden[name] for name in ("free", "costly", "rewards"))
     turns, n_queries = len(free), model.config.n_queries
-    noise = uniforms(np.full(turns, seed, np.uint64), np.arange(turns), n_queries + len(model.config.bins))
+    noise = uniforms(np.full(turns, seed, np.uint64), np.arange(turns), n_queries + model.config.n_actions)
     noise_BTn = torch.from_numpy(noise)[None]
     togo = facts.target_return - rewards.cumsum(0)
     target_cost = torch.full((1, turns, 1), model.config.target_cost)
@@ -116,7 +118,7 @@ def golden_episode(trained: Trained, seed: int = 0) -> dict[str, np.ndarray]:
         "rewards": rewards.numpy(),
         "probs": played.probs_BTM[0].numpy(),
         "queries": query[0].numpy().astype(np.uint8),
-        "actions": model.actions(played.hidden_BTW, noise_BTn[..., n_queries:])[0].numpy(),
+        "actions": model.action_head.actions(played.hidden_BTW, noise_BTn[..., n_queries:])[0].numpy(),
     }
     if model.config.has_memory:
         golden["hidden"] = played.hidden_BTW[0].numpy()
@@ -139,6 +141,8 @@ def export(config: ExportConfig) -> Bundle:
         bundle = Bundle.load(folder)
         for name in _COPIED:
             shutil.copy(config.run / name, folder / name)
+        if trained.facts.feature_map is not None:
+            trained.facts.feature_map.write(folder / FEATURE_MAP)
         plot_curves(folder / "metrics.jsonl", folder / "curves.png", trained.config)
         if config.out.exists():
             shutil.rmtree(config.out)
@@ -165,14 +169,20 @@ def _manifest(trained: Trained, folder: Path, asked: ExportConfig) -> Manifest:
         tolerance=asked.tolerance,
         files=files,
         provenance={
-            "dataset": config.dataset.name,
+            "dataset": config.dataset_name,
             "environment": config.environment,
             "seed": str(config.seed),
             "updates": str(trained.done),
             "acquisition": config.acquisition,
             "trained_budget": "conditioned" if config.budgets else str(config.budget),
+            **_references(config),
         },
     )
+
+
+def _references(config: TrainConfig) -> dict[str, str]:
+    returns = config.reference_returns
+    return {} if returns is None else {"reference_returns": f"{returns[0]} {returns[1]}"}
 
 
 def _context_sizes(sizes: ModelConfig) -> dict[str, int]:

@@ -59,7 +59,7 @@ class ActionGraph(nn.Module):
             new_keys.append(key)
             new_values.append(value)
         hidden = model.norm_out(x)
-        return model.actions(hidden, noise), hidden, torch.stack(new_keys), torch.stack(new_values)
+        return model.action_head.actions(hidden, noise), hidden, torch.stack(new_keys), torch.stack(new_values)
 
 
 class FrameActionGraph(nn.Module):
@@ -72,7 +72,7 @@ class FrameActionGraph(nn.Module):
     def forward(self, free: Tensor, costly: Tensor, query: Tensor, returns_to_go: Tensor, noise: Tensor) -> Tensor:
         model = self.model
         known = model.know(free, returns_to_go, torch.zeros_like(returns_to_go), costly)
-        return model.actions(model.hiddens(known, query), noise)
+        return model.action_head.actions(model.hiddens(known, query), noise)
 
 
 def example_inputs(model: BudgetedPolicy) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -81,7 +81,7 @@ def example_inputs(model: BudgetedPolicy) -> tuple[dict[str, Tensor], dict[str, 
     free, togo = torch.zeros(n, config.n_free), torch.zeros(n, 1)
     before, now = {"free": free, "returns_to_go": togo}, {"free": free}
     now |= {"costly": torch.zeros(n, len(config.owner)), "query": torch.zeros(n, config.n_queries)}
-    now |= {"returns_to_go": togo, "noise": torch.zeros(n, len(config.bins))}
+    now |= {"returns_to_go": togo, "noise": torch.zeros(n, config.n_actions)}
     if config.has_memory:
         slots = config.context_length - 1
         cache = torch.zeros(config.n_layers, n, config.n_heads, slots, config.width // config.n_heads)

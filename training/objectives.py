@@ -7,9 +7,8 @@ This module knows nothing about networks, data or optimisers: pure functions on 
 from __future__ import annotations
 
 from torch import Tensor
-from torch.nn import functional
 
-__all__ = ["action_loss", "nearest_bins", "penalty", "query_cost", "straight_through"]
+__all__ = ["action_loss", "penalty", "query_cost", "straight_through"]
 
 
 def straight_through(query: Tensor, probs: Tensor) -> Tensor:
@@ -29,20 +28,8 @@ def penalty(cost_BT: Tensor, budget: float | Tensor, valid_BT: Tensor, weight_BT
     return excess.sum() / valid_BT.sum()
 
 
-def nearest_bins(actions: Tensor, low: tuple[float, ...], high: tuple[float, ...], bins: tuple[int, ...]) -> Tensor:
-    """Index of the bin nearest to each action number, [..., A] long."""
-    low_A, high_A = actions.new_tensor(low), actions.new_tensor(high)
-    steps = actions.new_tensor(bins) - 1
-    scaled = (actions.clamp(low_A, high_A) - low_A) / (high_A - low_A) * steps
-    return scaled.round().long()
-
-
-def action_loss(logits: list[Tensor], bins_BTA: Tensor, valid_BT: Tensor, weight_BT: Tensor | None = None) -> Tensor:
-    """Δ = -log π̃(a_t | ...), summed over action components, averaged over timesteps that are not padding. Scalar.
-    `weight_BT` says how much each timestep's action is worth imitating (IQL's advantage weight; None: all the same)."""
-    counted = (valid_BT if weight_BT is None else valid_BT * weight_BT).flatten()
-    total = logits[0].new_zeros(())
-    for i, logits_BTn in enumerate(logits):
-        losses = functional.cross_entropy(logits_BTn.flatten(0, 1), bins_BTA[..., i].flatten(), reduction="none")
-        total = total + (losses * counted).sum()
-    return total / valid_BT.sum()
+def action_loss(losses_BT: Tensor, valid_BT: Tensor, weight_BT: Tensor | None = None) -> Tensor:
+    """Δ: the mean over timesteps that are not padding of -log π̃(a_t | ...). Scalar. `weight_BT` says how much each
+    timestep's action is worth imitating (IQL's advantage weight; None: all the same)."""
+    counted_BT = valid_BT if weight_BT is None else valid_BT * weight_BT
+    return (losses_BT * counted_BT).sum() / valid_BT.sum()

@@ -19,6 +19,7 @@ from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
 from protocol.features import CostModel
 from training.environments import Environment, open_environment
+from training.feature_map import FEATURE_MAP, FeatureMap
 from training.heat_map import HeatSums
 
 __all__ = ["Episode", "Group", "Player", "Terms"]
@@ -69,6 +70,8 @@ class Player:
         self._terms = terms
         self._bundle = Bundle.load(terms.bundle, replay=False)
         self._costs = CostModel.declared(self._bundle.manifest.features)
+        file = terms.bundle / FEATURE_MAP
+        self._feature_map = FeatureMap.read(file) if file.exists() else None
         self._budget_us = _UNLIMITED_US if terms.budget == 1.0 else terms.budget * self._costs.full_us
         self._idle: list[Environment] = []
 
@@ -96,7 +99,7 @@ class Player:
         handle = bots.start(1, seeds=[seed], budgets_us=[self._budget_us], target_costs_us=targets_us)
         if not self._idle:
             owner_D = self._bundle.manifest.features.owner
-            self._idle.append(open_environment(self._terms.environment, owner_D))
+            self._idle.append(open_environment(self._terms.environment, owner_D, self._feature_map))
         return _Game(seed, handle, self._idle.pop())
 
     def _turn(self, bots: Bots, frame: int, live: list[_Game], heat: HeatSums | None) -> bool:

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from training.action_heads import ActionHead, BinsHead, GaussianHead
+
 __all__ = ["BudgetedPolicy", "Known", "ModelConfig"]
 
 _COST_OCTAVES = 3
@@ -27,7 +29,7 @@ class ModelConfig:
     octaves: tuple[int, ...]  # sine/cosine octaves of each of the F free numbers: positions must be told apart finely
     owner: tuple[int, ...]  # costly feature that each of the D costly numbers belongs to
     n_queries: int  # M
-    bins: tuple[int, ...]  # bins of each action component, A of them
+    bins: tuple[int, ...]  # bins of each action component, A of them; none: each is a number with a certainty
     low: tuple[float, ...]  # lowest value of each action component
     high: tuple[float, ...]  # highest value of each action component
     sampled: tuple[bool, ...]  # True: the component is sampled from its bins, False: the most probable bin is taken
@@ -51,6 +53,11 @@ class ModelConfig:
     def n_free(self) -> int:
         """F."""
         return len(self.octaves)
+
+    @property
+    def n_actions(self) -> int:
+        """A."""
+        return len(self.low)
 
     @property
     def has_memory(self) -> bool:
@@ -143,7 +150,7 @@ class BudgetedPolicy(nn.Module, ABC):
         self.encode_context = nn.Linear(n_context, config.encoder_width)
         n_cost = 1 + 2 * _COST_OCTAVES if config.budget_conditioned else 0
         self.acquisition_head = AcquisitionHead(memory, n_context + n_cost, config)
-        self.action_head = nn.Linear(config.width, sum(config.bins))
+        self.action_head = _action_head(config)
 
     def context(self, free: Tensor, returns_to_go: Tensor) -> Tensor:
         """Free features [..., F] with their Fourier octaves, and the return-to-go [..., 1]: known before the query."""
@@ -187,22 +194,11 @@ class BudgetedPolicy(nn.Module, ABC):
     def memory(self, hidden_BTW: Tensor) -> Tensor:
         """What the acquisition head reads of the past at every timestep, [B, T, memory]."""
 
-    def action_logits(self, hidden: Tensor) -> list[Tensor]:
-        """Logits over the bins of each action component: A tensors [..., bins]."""
-        return list(self.action_head(hidden).split(self.config.bins, dim=-1))
 
-    def actions(self, hidden: Tensor, noise: Tensor) -> Tensor:
-        """Raw action numbers [..., A]; `noise` [..., A] uniform in [0, 1) drives the components that are sampled."""
-        config = self.config
-        chosen = []
-        for i, logits in enumerate(self.action_logits(hidden)):
-            if config.sampled[i]:
-                cumulative = torch.softmax(logits, dim=-1).cumsum(-1)
-                bin_ = (noise[..., i : i + 1] >= cumulative[..., :-1]).to(logits.dtype).sum(-1)
-            else:
-                bin_ = logits.argmax(-1).to(logits.dtype)
-            chosen.append(config.low[i] + bin_ * ((config.high[i] - config.low[i]) / (config.bins[i] - 1)))
-        return torch.stack(chosen, dim=-1)
+def _action_head(config: ModelConfig) -> ActionHead:
+    if not config.bins:
+        return GaussianHead(config.width, config.low, config.high)
+    return BinsHead(config.width, config.bins, config.low, config.high, config.sampled)
 
 
 def _cost_waves(target_cost: Tensor, low: float, high: float) -> Tensor:

@@ -147,7 +147,7 @@ def _choices(key: str, value: object) -> list[dict[str, object]]:
 
 def _name(config: TrainConfig, tags: list[str]) -> str:
     """Fixed parts, so that a sweep that grows keeps the names of its runs; then what else varies within its block."""
-    parts = [config.method, config.acquisition, config.dataset.name]
+    parts = [config.method, config.acquisition, config.dataset_name]
     if config.budgets:
         parts.append("conditioned")
     elif config.acquisition not in ("all", "none"):

@@ -1,4 +1,4 @@
-"""Recorded traces: reading a Minari dataset, returns-to-go, normalisation, and windows of timesteps.
+"""Recorded traces: returns-to-go, normalisation, and windows of timesteps.
 
 This module knows nothing about networks or games: what a trace holds is told by the feature table and the action
 layout that stand in the dataset's own metadata. Shape letters: E episodes, S steps of all episodes, and those of
@@ -7,13 +7,9 @@ layout that stand in the dataset's own metadata. Shape letters: E episodes, S st
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
-import minari
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -21,12 +17,12 @@ from rich.progress import track
 from torch import Tensor
 
 from protocol.features import ActionSpec, FeatureTable
+from training.datasets import Dataset, TracesError, open_dataset
+from training.feature_map import FeatureMap
 
 __all__ = ["Batch", "Traces", "TracesError", "draw_windows", "load_traces", "moments", "returns_to_go"]
 
-
-class TracesError(ValueError):
-    """A dataset that cannot be trained on: what is wrong and where."""
+_HALF_FROM = 256  # costly numbers: from here on half the memory matters, and rays carry no more precision than that
 
 
 @dataclass(frozen=True)
@@ -36,11 +32,12 @@ class Traces:
     features: FeatureTable
     action: ActionSpec
     free_SF: Tensor  # float32, raw units
-    costly_SD: Tensor  # float16, raw units: half the memory, and rays carry no more precision than that
+    costly_SD: Tensor  # float32, raw units; float16 where they are many
     actions_SA: Tensor  # float32
     returns_to_go_S: Tensor  # float32
     starts_E: NDArray[np.int64]  # first step of each episode
     lengths_E: NDArray[np.int64]
+    choices: int | None = None  # of a discrete action; None: the action is numbers
 
     @property
     def episode_returns_E(self) -> NDArray[np.float32]:
@@ -78,31 +75,39 @@ def returns_to_go(rewards_T: NDArray[np.floating]) -> NDArray[np.float32]:
     return rewards_T[::-1].cumsum(dtype=np.float64)[::-1].astype(np.float32)
 
 
-def load_traces(path: Path, *, episodes: int | None = None) -> Traces:
-    """Read a Minari dataset whose observations are {"free": [T+1, F], "costly": [T+1, D]}; `episodes` None reads all.
+def load_traces(*paths: Path, episodes: int | None = None, feature_map: FeatureMap | None = None) -> Traces:
+    """Read Minari datasets (training/datasets.py), an episode of each in turn; `episodes` of each, None: all.
 
-    Raises TracesError when the folder is no such dataset, holds HDF5 links out of itself, or does not match the feature
-    table in its metadata.
+    Raises TracesError when one is no such dataset, does not match its feature table, or differs from the others.
     """
-    dataset, features, action = _open(path)
-    total = dataset.total_episodes if episodes is None else min(dataset.total_episodes, episodes)
-    if total < 1:
-        raise TracesError(f"{path}: {total} of {dataset.total_episodes} episodes to read, expected 1 or more")
-    free, costly, actions, togo, lengths = [], [], [], [], []
-    for i in track(range(total), description=f"reading {path.name}"):
-        episode, where = dataset[i], f"{path}: episode {i}"
-        n = len(episode.rewards)
-        free.append(_rows(where, "free", episode.observations["free"][:n], (n, features.n_free), np.float32))
-        costly.append(_rows(where, "costly", episode.observations["costly"][:n], (n, features.n_costly), np.float16))
-        actions.append(_rows(where, "actions", episode.actions, (n, action.size), np.float32))
-        rewards = _rows(where, "rewards", np.asarray(episode.rewards), (n,), np.float64)
+    datasets = [open_dataset(path, feature_map) for path in paths]
+    first = datasets[0]
+    for dataset in datasets[1:]:
+        if (dataset.features, dataset.action) != (first.features, first.action):
+            raise TracesError(f"{dataset.path} and {first.path} have other features or other actions")
+    wanted = sorted((i, part) for part, dataset in enumerate(datasets) for i in range(_count(dataset, episodes)))
+    half = first.features.n_costly >= _HALF_FROM
+    free, costly, actions, togo = [], [], [], []
+    for i, part in track(wanted, description=f"reading {', '.join(dataset.path.name for dataset in datasets)}"):
+        read, where = datasets[part].episode(i), f"{datasets[part].path}: episode {i}"
+        n = len(read.rewards_T)
+        free.append(_rows(where, "free", read.free_TF, (n, first.features.n_free), np.float32))
+        kind = np.float16 if half else np.float32
+        costly.append(_rows(where, "costly", read.costly_TD, (n, first.features.n_costly), kind))
+        actions.append(_rows(where, "actions", read.actions_TA, (n, first.action.size), np.float32))
+        rewards = _rows(where, "rewards", read.rewards_T, (n,), np.float64)
         togo.append(torch.from_numpy(returns_to_go(rewards.numpy())))
-        lengths.append(n)
-    lengths_E = np.array(lengths, dtype=np.int64)
+    lengths_E = np.array([len(part) for part in togo], dtype=np.int64)
     starts_E = np.concatenate([[0], lengths_E.cumsum()[:-1]])
-    return Traces(
-        features, action, torch.cat(free), torch.cat(costly), torch.cat(actions), torch.cat(togo), starts_E, lengths_E
-    )
+    numbers = (torch.cat(part) for part in (free, costly, actions, togo))
+    return Traces(first.features, first.action, *numbers, starts_E, lengths_E, first.choices)
+
+
+def _count(dataset: Dataset, episodes: int | None) -> int:
+    count = len(dataset) if episodes is None else min(len(dataset), episodes)
+    if count < 1:
+        raise TracesError(f"{dataset.path}: {count} of {len(dataset)} episodes to read, expected 1 or more")
+    return count
 
 
 def moments(x_SD: Tensor) -> tuple[Tensor, Tensor]:
@@ -144,31 +149,6 @@ def draw_windows(traces: Traces, batch: int, length: int, generator: np.random.G
     )
 
 
-def _open(path: Path) -> tuple[minari.MinariDataset, FeatureTable, ActionSpec]:
-    data = path / "data"
-    if not (data / "metadata.json").is_file():
-        raise TracesError(f"{path} is not a Minari dataset: it has no data/metadata.json")
-    _refuse_links(data)
-    try:
-        metadata = json.loads((data / "metadata.json").read_bytes())
-        features = msgspec.json.decode(_text(metadata["features"]), type=FeatureTable)
-        action = msgspec.json.decode(_text(metadata["action"]), type=ActionSpec)
-        # Without both spaces minari would make the environment that the metadata name, and run code of their choice.
-        observed = set(json.loads(metadata["observation_space"])["subspaces"])
-        json.loads(metadata["action_space"])
-    except (KeyError, TypeError, ValueError, msgspec.DecodeError) as error:
-        raise TracesError(
-            f"{path}: metadata must hold 'features', 'action', 'observation_space' and 'action_space': {error}"
-        ) from error
-    if not {"free", "costly"} <= observed:
-        raise TracesError(f"{path}: observations hold {sorted(observed)}, expected 'free' and 'costly'")
-    return minari.MinariDataset(data), features, action
-
-
-def _text(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
-
-
 def _rows(where: str, name: str, array: NDArray[np.floating], shape: tuple[int, ...], dtype: type) -> Tensor:
     """The array as it is kept; numbers that do not fit `dtype` are refused like any that are not finite."""
     if array.shape != shape:
@@ -178,28 +158,3 @@ def _rows(where: str, name: str, array: NDArray[np.floating], shape: tuple[int, 
     if not np.isfinite(kept).all():
         raise TracesError(f"{where}: {name} has numbers that are not finite as {np.dtype(dtype)}")
     return torch.from_numpy(kept)
-
-
-def _refuse_links(folder: Path) -> None:
-    """An HDF5 file may point at other files; a dataset from outside must not (nor may its files be links, nor its
-    groups form anything but a tree)."""
-    for file in folder.glob("*.hdf5"):
-        if file.is_symlink():
-            raise TracesError(f"{file} is a symbolic link, expected a regular file")
-        with h5py.File(file) as root:
-            groups, seen = [root], {h5py.h5o.get_info(root.id).addr}
-            while groups:
-                group = groups.pop()
-                for name in group:
-                    link = group.get(name, getlink=True)
-                    if not isinstance(link, h5py.HardLink):
-                        raise TracesError(f"{file}: {group.name}/{name} is a {type(link).__name__}, expected data")
-                    child = group[name]
-                    if isinstance(child, h5py.Group):
-                        address = h5py.h5o.get_info(child.id).addr
-                        if address in seen:
-                            raise TracesError(f"{file}: {group.name}/{name} is a group that has another place as well")
-                        seen.add(address)
-                        groups.append(child)
-                    elif child.external or child.is_virtual:
-                        raise TracesError(f"{file}: {child.name} keeps its data in another file, expected it inside")

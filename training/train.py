@@ -24,8 +24,9 @@ from training.build import build_critics, build_model
 from training.checkpoint import Facts, load_checkpoint
 from training.config import TrainConfig
 from training.control import Control, draw_costs
+from training.feature_map import FeatureMap
 from training.iql import Critics
-from training.objectives import action_loss, nearest_bins, query_cost
+from training.objectives import action_loss, query_cost
 from training.policy import BudgetedPolicy, Known
 from training.record import RunRecord, write_versions
 from training.traces import Batch, Traces, draw_windows, load_traces
@@ -178,8 +179,8 @@ def held_out_loss(config: TrainConfig, model: BudgetedPolicy, traces: Traces, co
 
 
 def _delta(model: BudgetedPolicy, sampled: Rollout, batch: Batch, weight_BT: Tensor | None) -> Tensor:
-    bins_BTA = nearest_bins(batch.actions_BTA, model.config.low, model.config.high, model.config.bins)
-    return action_loss(model.action_logits(sampled.hidden_BTW), bins_BTA, batch.valid_BT, weight_BT)
+    losses_BT = model.action_head.losses(sampled.hidden_BTW, batch.actions_BTA)
+    return action_loss(losses_BT, batch.valid_BT, weight_BT)
 
 
 def _spent(config: TrainConfig, cost_BT: Tensor, drawn: Drawn) -> dict[str, float]:
@@ -204,9 +205,11 @@ def _weights(control: Control) -> dict[str, float]:
 def train(config: TrainConfig) -> TrainState:
     """Train to the end, from the run's checkpoint if there is one; returns the final state."""
     config.out.mkdir(parents=True, exist_ok=True)
-    traces = load_traces(config.dataset, episodes=config.episodes)
+    feature_map = None if config.feature_map is None else FeatureMap.read(config.feature_map)
+    paths = (config.dataset, *config.more_datasets)
+    traces = load_traces(*paths, episodes=config.episodes, feature_map=feature_map)
     state = new_state(config, traces)
-    facts = Facts.of(traces, config.target_return)
+    facts = Facts.of(traces, config.target_return, feature_map)
     if (config.out / "checkpoint.pt").exists():
         load_checkpoint(config.out / "checkpoint.pt", config, state)
     config.write(config.out / "config.json")

@@ -56,14 +56,14 @@ def network(
 
 
 def batch(seed: int, size: int, length: int) -> tuple[torch.Tensor, ...]:
-    """free, costly, returns_to_go, uniforms, bins."""
+    """free, costly, returns_to_go, uniforms, actions."""
     g = torch.Generator().manual_seed(seed)
     return (
         torch.randn(size, length, F, generator=g),
         torch.randn(size, length, len(OWNER), generator=g),
         torch.randn(size, length, 1, generator=g),
         torch.rand(size, length, M, generator=g),
-        torch.randint(0, 2, (size, length, 2), generator=g),
+        torch.rand(size, length, 2, generator=g),
     )
 
 
@@ -117,11 +117,12 @@ def test_what_is_sampled_fits_its_budget(seed: int, bots: int) -> None:
     assert (together.view(2, bots, M)[fits] == sampled.view(2, bots, M)[fits]).all(), "what fits is left as it is"
 
 
-def objective(model: BudgetedDecisionTransformer, bins: torch.Tensor, gamma: float):
+def objective(model: BudgetedDecisionTransformer, actions: torch.Tensor, gamma: float):
     def loss(sampled: Rollout) -> torch.Tensor:
-        valid = torch.ones(bins.shape[:2])
+        valid = torch.ones(actions.shape[:2])
         cost = query_cost(sampled.query_BTM, COSTS)
-        return action_loss(model.action_logits(sampled.hidden_BTW), bins, valid) + gamma * penalty(cost, 0.2, valid)
+        delta = action_loss(model.action_head.losses(sampled.hidden_BTW, actions), valid)
+        return delta + gamma * penalty(cost, 0.2, valid)
 
     return loss
 
@@ -135,8 +136,8 @@ def gradients(model: BudgetedDecisionTransformer) -> dict[str, torch.Tensor]:
 def test_enough_sweeps_give_the_sequential_gradient(seed: int, allocated: bool) -> None:
     length = 7
     model = network(seed)
-    free, costly, togo, uniforms, bins = batch(seed, 2, length)
-    loss = objective(model, bins, gamma=0.7)
+    free, costly, togo, uniforms, actions = batch(seed, 2, length)
+    loss = objective(model, actions, gamma=0.7)
     fit = fit_frames(COSTS, torch.tensor([0.2, 0.4]), 2) if allocated else None
     reference = sample_queries_sequentially(model, know(model, free, costly, togo), uniforms, fit)
     value = loss(reference)
@@ -152,13 +153,13 @@ def test_enough_sweeps_give_the_sequential_gradient(seed: int, allocated: bool) 
 
 def test_penalty_moves_the_acquisition_path_only() -> None:
     model = network(0)
-    free, costly, togo, uniforms, bins = batch(0, 2, 6)
+    free, costly, togo, uniforms, actions = batch(0, 2, 6)
 
     def run(gamma: float) -> dict[str, torch.Tensor]:
         model.zero_grad()
         query, _ = sample_queries(model, know(model, free, costly, togo), uniforms)
         sampled = rollout(model, know(model, free, costly, togo), query.requires_grad_())
-        backward(sampled, objective(model, bins, gamma), 2, list(model.parameters()))
+        backward(sampled, objective(model, actions, gamma), 2, list(model.parameters()))
         return gradients(model)
 
     without, with_penalty = run(0.0), run(5.0)
@@ -171,13 +172,13 @@ def test_penalty_moves_the_acquisition_path_only() -> None:
 @pytest.mark.parametrize(("acquisition", "value"), [("all", 1.0), ("none", 0.0)])
 def test_forced_acquisition(acquisition: str, value: float) -> None:
     model = network(0, acquisition=acquisition)
-    free, costly, togo, uniforms, bins = batch(0, 2, 6)
+    free, costly, togo, uniforms, actions = batch(0, 2, 6)
     known = know(model, free, costly, togo)
     query, _ = sample_queries(model, known, uniforms)
     assert (query == value).all()
     sampled = rollout(model, known, query.requires_grad_())
     assert (sampled.probs_BTM == value).all()
-    backward(sampled, objective(model, bins, 0.0), 2, list(model.parameters()))
+    backward(sampled, objective(model, actions, 0.0), 2, list(model.parameters()))
     assert model.action_head.weight.grad is not None
 
 

@@ -60,7 +60,7 @@ def test_served_bots_equal_torch_over_a_whole_episode(trained: tuple[Path, Train
         known = model.know(*frames, torch.from_numpy(costly).transpose(0, 1))
         hidden = model.hiddens(known, query)
         expected = model.query_probs(model.memory(hidden), known).transpose(0, 1).numpy()
-        expected_actions = model.actions(hidden, torch.zeros(n, turns, 2)).transpose(0, 1).numpy()
+        expected_actions = model.action_head.actions(hidden, torch.zeros(n, turns, 2)).transpose(0, 1).numpy()
     assert np.abs(np.array(probs) - expected).max() <= 1e-4
     assert np.abs(np.array(actions) - expected_actions).max() <= 1e-4
     assert 0.05 < np.mean(queries) < 0.95

@@ -75,7 +75,7 @@ def test_incremental_equals_windowed_over_an_episode_longer_than_the_span(seed: 
             free[:, t], costly[:, t], query[:, t], togo[:, t], noise[:, t], keys, values, ages
         )
         assert torch.allclose(hidden, windowed[:, t], atol=1e-5)
-        assert torch.allclose(actions, model.actions(windowed[:, t], noise[:, t]))
+        assert torch.allclose(actions, model.action_head.actions(windowed[:, t], noise[:, t]))
         slot = t % slots
         keys[:, :, :, slot], values[:, :, :, slot] = new_keys, new_values
         ages = (ages + 1).clamp(max=config.context_length)
@@ -86,8 +86,8 @@ def test_sampled_component_follows_its_probabilities() -> None:
     model = network(0)
     hidden = torch.randn(1, 8)
     noise = torch.linspace(0, 0.9999, 2000)[:, None].expand(-1, 2)
-    actions = model.actions(hidden.expand(2000, -1), noise)
-    expected = torch.softmax(model.action_logits(hidden)[1], -1)[0, 1].item()
+    actions = model.action_head.actions(hidden.expand(2000, -1), noise)
+    expected = torch.softmax(model.action_head.logits(hidden)[1], -1)[0, 1].item()
     assert actions[:, 1].mean().item() == pytest.approx(expected, abs=2e-3)
     assert actions[:, 0].unique().numel() == 1
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from training.objectives import action_loss, nearest_bins, penalty, query_cost, straight_through
+from training.objectives import action_loss, penalty, query_cost, straight_through
 
 bits = st.lists(st.integers(0, 1), min_size=3, max_size=3)
 
@@ -26,28 +24,16 @@ def test_penalty_is_equation_2(queries: list[list[int]], budget: float, costs: l
 
 def test_padding_changes_neither_loss_nor_penalty() -> None:
     torch.manual_seed(0)
-    logits, bins = torch.randn(2, 5, 4), torch.randint(0, 4, (2, 5, 1))
+    losses, cost = torch.rand(2, 5), torch.rand(2, 5)
     valid = torch.tensor([[1, 1, 1, 0, 0], [1, 1, 1, 1, 1.0]])
-    cost = torch.rand(2, 5)
-    other_logits, other_bins, other_cost = logits.clone(), bins.clone(), cost.clone()
-    other_logits[0, 3:] += 100
-    other_bins[0, 3:] = 0
+    other_losses, other_cost = losses.clone(), cost.clone()
+    other_losses[0, 3:] += 100
     other_cost[0, 3:] = 1
-    assert torch.equal(action_loss([logits], bins, valid), action_loss([other_logits], other_bins, valid))
+    assert torch.equal(action_loss(losses, valid), action_loss(other_losses, valid))
     assert torch.equal(penalty(cost, 0.3, valid), penalty(other_cost, 0.3, valid))
     alone = slice(0, 1), slice(0, 3)  # the first row without its padding
     assert penalty(cost[:1], 0.3, valid[:1]).item() == pytest.approx(penalty(cost[alone], 0.3, valid[alone]).item())
-    padded, unpadded = (
-        action_loss([logits[:1]], bins[:1], valid[:1]),
-        action_loss([logits[alone]], bins[alone], valid[alone]),
-    )
-    assert padded.item() == pytest.approx(unpadded.item())
-
-
-def test_action_loss_sums_components_and_averages_timesteps() -> None:
-    logits = [torch.zeros(1, 2, 4), torch.zeros(1, 2, 2)]
-    loss = action_loss(logits, torch.zeros(1, 2, 2, dtype=torch.long), torch.ones(1, 2))
-    assert loss.item() == pytest.approx(math.log(4) + math.log(2))
+    assert action_loss(losses[:1], valid[:1]).item() == pytest.approx(losses[alone].mean().item())
 
 
 def test_straight_through_is_the_sample_in_value_and_the_probability_in_gradient() -> None:
@@ -60,13 +46,6 @@ def test_straight_through_is_the_sample_in_value_and_the_probability_in_gradient
 
 
 def test_a_timestep_that_is_worth_more_counts_more() -> None:
-    torch.manual_seed(1)
-    logits, bins, valid = torch.randn(1, 3, 4), torch.randint(0, 4, (1, 3, 1)), torch.tensor([[1.0, 1.0, 0.0]])
-    each = [action_loss([logits[:, t : t + 1]], bins[:, t : t + 1], torch.ones(1, 1)).item() for t in range(2)]
-    weighted = action_loss([logits], bins, valid, torch.tensor([[3.0, 0.5, 100.0]]))
-    assert weighted.item() == pytest.approx((3.0 * each[0] + 0.5 * each[1]) / 2)
-
-
-def test_nearest_bins_at_and_beyond_the_edges() -> None:
-    actions = torch.tensor([[-1.0, 0.0], [1.0, 1.0], [0.09, 0.51], [7.0, -3.0]])
-    assert nearest_bins(actions, (-1.0, 0.0), (1.0, 1.0), (11, 2)).tolist() == [[0, 0], [10, 1], [5, 1], [10, 0]]
+    losses, valid = torch.tensor([[2.0, 4.0, 8.0]]), torch.tensor([[1.0, 1.0, 0.0]])
+    weighted = action_loss(losses, valid, torch.tensor([[3.0, 0.5, 100.0]]))
+    assert weighted.item() == pytest.approx((3.0 * 2.0 + 0.5 * 4.0) / 2)

@@ -113,7 +113,7 @@ def test_refuses_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
     ("array", "place", "value", "message"),
     [
         ("observations/costly", (2, 1), np.nan, "costly has numbers that are not finite"),
-        ("observations/costly", (2, 1), 1e5, "costly has numbers that are not finite as float16"),
+        ("observations/costly", (2, 1), -np.inf, "costly has numbers that are not finite"),
         ("observations/free", (0, 0), np.inf, "free has numbers that are not finite"),
         ("rewards", (1,), np.nan, "rewards has numbers that are not finite"),
     ],
@@ -141,7 +141,7 @@ def test_refuses_arrays_of_different_length(dataset: Path, tmp_path: Path, array
         load_traces(bad)
 
 
-@pytest.mark.parametrize("key", ["features", "action", "observation_space", "action_space"])
+@pytest.mark.parametrize("key", ["features", "observation_space", "action_space"])
 def test_refuses_metadata_that_lack_a_key(dataset: Path, tmp_path: Path, key: str) -> None:
     """Without its spaces, minari would make the environment that the metadata name: any callable there is."""
     bad = tmp_path / "bad"
@@ -150,7 +150,7 @@ def test_refuses_metadata_that_lack_a_key(dataset: Path, tmp_path: Path, key: st
     metadata = json.loads(file.read_text())
     del metadata[key]
     file.write_text(json.dumps(metadata))
-    with pytest.raises(TracesError, match=f"metadata must hold .*: '{key}'"):
+    with pytest.raises(TracesError, match="tells no features" if key == "features" else f"there is no '{key}'"):
         load_traces(bad)
 
 
