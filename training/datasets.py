@@ -66,7 +66,7 @@ class Dataset:
                 free, costly = self._feature_map.split(parts, np.random.default_rng([number, n]))
         except (IndexError, KeyError, ValueError) as error:
             raise TracesError(f"{self.path}: episode {number}: {error}") from error
-        return Recorded(free, costly, np.asarray(read.actions).reshape(n, -1), rewards)
+        return Recorded(free, costly, _columns(np.asarray(read.actions)), rewards)
 
 
 def open_dataset(path: Path, feature_map: FeatureMap | None = None) -> Dataset:
@@ -199,3 +199,8 @@ def _refuse_links(folder: Path) -> None:
                         groups.append(child)
                     elif child.external or child.is_virtual:
                         raise TracesError(f"{file}: {child.name} keeps its data in another file, expected it inside")
+
+
+def _columns(actions: NDArray[np.floating]) -> NDArray[np.floating]:
+    """A discrete action is recorded as one number a timestep."""
+    return actions[:, None] if actions.ndim == 1 else actions
