@@ -25,6 +25,8 @@ from bot_runtime.spending import Limits, Spending
 from bot_runtime.turns import Actions, Queries, Turn, Turns
 from protocol.errors import BadSchema, FrameReused
 from protocol.features import CostModel
+from protocol.messages import MAX_RETURN
+from protocol.values import check_frame
 
 __all__ = ["Bots"]
 
@@ -59,9 +61,7 @@ class Bots:
         self._turns = Turns(max_bots, self.counters)
         self._spending = Spending(bundle.manifest, max_bots)
         self._started = 0
-        components = bundle.manifest.action.components
-        self._low_A = np.array([component.low for component in components], dtype=np.float32)
-        self._high_A = np.array([component.high for component in components], dtype=np.float32)
+        self._low_A, self._high_A = bundle.manifest.action.range
 
     @property
     def n_bots(self) -> int:
@@ -91,12 +91,12 @@ class Bots:
         """
         if count < 1:
             raise BadSchema(f"count is {count}, expected at least 1")
-        manifest, limit = self.bundle.manifest, inputs.MAX_RETURN
+        manifest = self.bundle.manifest
         model = cost_model or CostModel.declared(manifest.features)
         inputs.check_costs(model, manifest.features)
         returns_N = np.full(count, manifest.target_return)
         if target_returns is not None:
-            returns_N = inputs.per_bot("target_returns", target_returns, count, -limit, limit)
+            returns_N = inputs.per_bot("target_returns", target_returns, count, -MAX_RETURN, MAX_RETURN)
         limits = Limits.checked(count, budgets_us, target_costs_us)
         numbered = range(self._started, self._started + count)
         seeds_N = inputs.seeds(numbered if seeds is None else seeds, count)
@@ -124,12 +124,11 @@ class Bots:
         NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
         """
         slots_N = self._slots.resolve(handles)
-        inputs.check_frame(frame)
+        check_frame(frame)
         retried = self._turns.query(handles, slots_N, frame)
         inputs.check_free(free_NF, handles, self.bundle.manifest.features)
-        limit = inputs.MAX_RETURN
         rewards_N = np.zeros(handles.size) if rewards_N is None else rewards_N
-        rewards_N = inputs.per_bot("rewards", rewards_N, handles.size, -limit, limit)
+        rewards_N = inputs.per_bot("rewards", rewards_N, handles.size, -MAX_RETURN, MAX_RETURN)
         limits = Limits.checked(handles.size, budgets_us, target_costs_us, frame_budget_us)
         request = (free_NF.copy(), rewards_N, *limits)
         if retried is not None:
@@ -156,7 +155,7 @@ class Bots:
         OutOfRange, FrameReused.
         """
         slots_N = self._slots.resolve(handles)
-        inputs.check_frame(frame)
+        check_frame(frame)
         turn = self._turns.features(handles, slots_N, frame)
         table, query_NM = self.bundle.manifest.features, turn.queries.query_NM
         acquired_NM, known_ND = inputs.check_features(acquired_NM, costly_ND, failed_NM, query_NM, handles, table)

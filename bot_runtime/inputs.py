@@ -1,4 +1,4 @@
-"""What an engine sends, checked: shapes, finite numbers, declared ranges, and features that were asked for.
+"""What an engine sends, checked: `protocol.values`, one number a bot, and features that were asked for.
 
 This module knows nothing about contexts, turns or policies. Nothing is ever clipped or repaired: a value is legal, or
 its request is refused with the bot, the feature, what was expected and what came.
@@ -11,23 +11,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.errors import BadSchema, BadShape, MissingFeature, NonFinite, OutOfRange, UnrequestedFeature
+from protocol.errors import BadShape, MissingFeature, NonFinite, OutOfRange, UnrequestedFeature
 from protocol.features import CostModel, Feature, FeatureTable
-from protocol.messages import MAX_FRAME
+from protocol.values import check_shape, check_values
 
-__all__ = ["MAX_RETURN", "check_costs", "check_features", "check_frame", "check_free", "per_bot", "seeds"]
+__all__ = ["check_costs", "check_features", "check_free", "per_bot", "seeds"]
 
-MAX_RETURN = 1e9  # of one reward or target return: float32 holds sums of very many
 _MAX_SEED = 2**64 - 1
 
 _Floats = NDArray[np.float32]
 _Bools = NDArray[np.bool_]
-
-
-def check_frame(frame: int) -> None:
-    """Raises BadSchema unless `frame` is within 0 to 2^53."""
-    if not 0 <= frame <= MAX_FRAME:
-        raise BadSchema(f"frame is {frame}, expected 0 to {MAX_FRAME}")
 
 
 def check_costs(model: CostModel, table: FeatureTable) -> None:
@@ -66,8 +59,8 @@ def seeds(numbers: Sequence[int] | NDArray[np.integer], n_bots: int) -> NDArray[
 
 def check_free(free_NF: _Floats, handles_N: NDArray[np.int64], table: FeatureTable) -> None:
     """Raises BadShape, NonFinite or OutOfRange unless these are legal free numbers of these bots."""
-    _check_shape("free", free_NF, (handles_N.size, table.n_free), np.dtype(np.float32))
-    _check_values(free_NF, None, handles_N, table.free, table.free_range)
+    check_shape("free", free_NF, (handles_N.size, table.n_free), np.float32)
+    check_values(free_NF, None, handles_N, table.free, table.free_range)
 
 
 def check_features(
@@ -84,15 +77,15 @@ def check_features(
     NonFinite and OutOfRange for acquired values. Other values are never looked at.
     """
     bits, numbers = (handles_N.size, table.n_queries), (handles_N.size, table.n_costly)
-    _check_shape("acquired", acquired_NM, bits, np.dtype(np.bool_))
-    _check_shape("values", costly_ND, numbers, np.dtype(np.float32))
+    check_shape("acquired", acquired_NM, bits, np.bool_)
+    check_shape("values", costly_ND, numbers, np.float32)
     answered_NM, known_NM = acquired_NM, query_NM
     if failed_NM is not None:
-        _check_shape("failed", failed_NM, bits, np.dtype(np.bool_))
+        check_shape("failed", failed_NM, bits, np.bool_)
         answered_NM, known_NM = acquired_NM | failed_NM, query_NM & ~failed_NM
     _check_answered(answered_NM, query_NM, handles_N, table.costly)
     known_ND = known_NM[:, table.owner]
-    _check_values(costly_ND, known_ND, handles_N, table.costly, table.costly_range)
+    check_values(costly_ND, known_ND, handles_N, table.costly, table.costly_range)
     return known_NM, np.where(known_ND, costly_ND, np.float32(0.0))
 
 
@@ -107,32 +100,3 @@ def _check_answered(
     if answered_NM[row, column]:
         raise UnrequestedFeature(f"{where} came or failed, but was not asked for")
     raise MissingFeature(f"{where} was asked for, and neither came nor is marked failed")
-
-
-def _check_shape(name: str, array: NDArray[np.generic], shape: tuple[int, int], dtype: np.dtype[np.generic]) -> None:
-    if array.shape != shape or array.dtype != dtype:
-        got = f"{array.dtype} {list(array.shape)}"
-        raise BadShape(f"{name} is {got}, expected {dtype} {list(shape)}, one row a bot")
-
-
-def _check_values(
-    values: _Floats,
-    known: _Bools | None,
-    handles_N: NDArray[np.int64],
-    features: tuple[Feature, ...],
-    limits: tuple[_Floats, _Floats],
-) -> None:
-    """Each is [N, numbers]; where `known` is given, only those numbers count."""
-    legal = (values >= limits[0]) & (values <= limits[1])  # false for NaN
-    if known is not None:
-        legal |= ~known
-    if legal.all():
-        return
-    finite = np.isfinite(values) if known is None else np.isfinite(values) | ~known
-    bad = ~(legal if finite.all() else finite)
-    row, column = (int(index) for index in np.argwhere(bad)[0])
-    owner = int(np.repeat(np.arange(len(features)), [feature.size for feature in features])[column])
-    feature, where = features[owner], f"of bot {handles_N[row]} is {values[row, column]}"
-    if not finite.all():
-        raise NonFinite(f"{feature.name} {where}, expected a finite number")
-    raise OutOfRange(f"{feature.name} {where}, expected {feature.low:g} to {feature.high:g}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from functools import cached_property
+from typing import ClassVar
 
 import msgspec
 import numpy as np
@@ -139,6 +140,7 @@ class CostModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=Tr
 class ActionComponent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One number of an action; `safe` is what a bot does when nothing better is known."""
 
+    size: ClassVar[int] = 1
     name: str
     low: float
     high: float
@@ -172,13 +174,20 @@ class ActionSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=T
         return len(self.components)
 
     @cached_property
+    def range(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Lowest and highest legal value of each number, each shape [A]."""
+        return _ranges(self.components)
+
+    @cached_property
     def safe(self) -> NDArray[np.float32]:
         """The declared safe action, shape [A]."""
         return np.array([component.safe for component in self.components], dtype=np.float32)
 
 
-def _ranges(features: tuple[Feature, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    sizes = [feature.size for feature in features]
-    low = np.repeat(np.array([feature.low for feature in features], dtype=np.float32), sizes)
-    high = np.repeat(np.array([feature.high for feature in features], dtype=np.float32), sizes)
+def _ranges(
+    parts: tuple[Feature, ...] | tuple[ActionComponent, ...],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    sizes = [part.size for part in parts]
+    low = np.repeat(np.array([part.low for part in parts], dtype=np.float32), sizes)
+    high = np.repeat(np.array([part.high for part in parts], dtype=np.float32), sizes)
     return low, high

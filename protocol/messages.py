@@ -15,6 +15,7 @@ from protocol.features import ActionSpec, CostModel, FeatureTable
 __all__ = [
     "MAX_BOTS_PER_MESSAGE",
     "MAX_FRAME",
+    "MAX_RETURN",
     "PROTOCOL_VERSION",
     "Actions",
     "Bits",
@@ -38,6 +39,7 @@ __all__ = [
 PROTOCOL_VERSION = 1
 MAX_BOTS_PER_MESSAGE = 65536
 MAX_FRAME = 2**53  # the largest count that a JSON number or a double holds exactly
+MAX_RETURN = 1e9  # of one reward or target return: float32 holds sums of very many
 
 Blob = bytes | Annotated[list[list[float]], Meta(max_length=MAX_BOTS_PER_MESSAGE)]
 """float32 [N, n]: little-endian row-major bytes in msgpack, nested lists in JSON."""
