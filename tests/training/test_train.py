@@ -29,7 +29,7 @@ def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Pat
         known = model.know(traces.free_SF[first][None], togo, target_cost, traces.costly_SD[first].float()[None])
         query, _ = sample_queries(model, known, torch.full((1, first.stop, 4), 0.5))
         sampled = rollout(model, known, query)
-        push = model.actions(sampled.hidden_BTW, torch.zeros(1, first.stop, 2))[0, :, 0]
+        push = model.action_head.actions(sampled.hidden_BTW, torch.zeros(1, first.stop, 2))[0, :, 0]
     left, right, noise, dear = sampled.probs_BTM[0].mean(0).tolist()
     assert max(noise, dear) < 0.2 < 0.5 < max(left, right)
     assert (push == traces.actions_SA[first, 0]).float().mean() > 0.8
