@@ -33,7 +33,7 @@ from training.acquisition import (
 )
 from training.config import TrainConfig
 from training.control import Control
-from training.objectives import action_loss, nearest_bins, query_cost
+from training.objectives import action_loss, query_cost
 from training.policy import Known
 from training.traces import Traces
 from training.train import Drawn, TrainState, draw, know, new_state
@@ -77,11 +77,11 @@ def _ways(config: TrainConfig, state: TrainState, costs_M: torch.Tensor) -> dict
 
     def loss(sampled: Rollout, drawn: Drawn) -> torch.Tensor:
         batch = drawn.batch
-        bins = nearest_bins(batch.actions_BTA, model.config.low, model.config.high, model.config.bins)
         penalised, _ = Control.of("algorithm-1", 1.0, 1).penalty(
             query_cost(sampled.query_BTM, costs_M), drawn.target_B, drawn.stratum_B, batch.valid_BT
         )
-        return action_loss(model.action_logits(sampled.hidden_BTW), bins, batch.valid_BT) + penalised
+        delta = action_loss(model.action_head.losses(sampled.hidden_BTW, batch.actions_BTA), batch.valid_BT)
+        return delta + penalised
 
     def sequential(drawn: Drawn) -> torch.Tensor:
         sampled = sample_queries_sequentially(model, know(model, drawn), drawn.uniforms_BTM)

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import get_origin, get_type_hints
+from typing import Literal, get_origin, get_type_hints
 
 import msgspec
 
@@ -40,12 +40,15 @@ class EvaluateSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     episodes: int = 256
     costs: tuple[float, ...] = (0.5, 0.1, 0.01)  # C of a budget-conditioned network; others have their own
+    kinds: tuple[Literal["soft", "hard"], ...] = ("soft", "hard")  # without a cap, and with what a frame shares capped
     heat_map: bool = False  # of the evaluation without caps whose C is nearest the run's budget
 
     def __post_init__(self) -> None:
         labels = [f"{cost:g}" for cost in self.costs]
         if not labels or len(set(labels)) < len(labels):
             raise ValueError(f"costs is {list(self.costs)}, expected one or more, all different")
+        if not self.kinds or len(set(self.kinds)) < len(self.kinds):
+            raise ValueError(f"kinds is {list(self.kinds)}, expected one or both, each once")
 
 
 class SweepSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -178,7 +181,7 @@ def _evaluations(config: TrainConfig, asked: EvaluateSpec) -> dict[str, Evaluate
     costs = asked.costs if conditioned else (config.budget if forced is None else forced,)
     nearest = min(costs, key=lambda cost: abs(cost - config.budget))
     evaluations = {}
-    for cost, kind in itertools.product(costs, ("soft",) if forced is not None else ("soft", "hard")):
+    for cost, kind in itertools.product(costs, ("soft",) if forced is not None else asked.kinds):
         label = f"{kind}-{cost:g}"
         evaluations[label] = EvaluateConfig(
             bundle=config.out / "bundle",
