@@ -22,6 +22,7 @@ from rich.progress import Progress
 
 from bot_runtime.bundle import Bundle
 from bot_runtime.manifest import Manifest
+from training.feature_map import FEATURE_MAP, FeatureMap
 from training.heat_map import HeatSums
 from training.play import Episode, Group, Player, Terms
 
@@ -81,6 +82,8 @@ class Evaluation:
     target_cost: float | None  # C asked of the network (None: not conditioned)
     frame_budget: float | None  # shared by all bots alive in a frame (None: none)
     bots: int
+    normalised_mean: float | None  # return_mean where the bundle's reference returns are 0 and 100
+    acquired_pct: dict[str, float]  # of the features of each group that its feature map names, mean over frames
 
 
 def evaluate(config: EvaluateConfig) -> tuple[Evaluation, list[Episode]]:
@@ -95,8 +98,7 @@ def evaluate(config: EvaluateConfig) -> tuple[Evaluation, list[Episode]]:
     episodes = sorted((episode for group in groups for episode in group.episodes), key=lambda episode: episode.seed)
     if config.heat_map is not None:
         _write_heat_map(config.heat_map, groups, bundle.manifest)
-    violations = sum(group.violations for group in groups)
-    return _summary(config, terms, bundle.manifest, episodes, violations), episodes
+    return _summary(config, terms, bundle.manifest, episodes, groups), episodes
 
 
 def write_evaluation(path: Path, evaluation: Evaluation, episodes: list[Episode]) -> None:
@@ -153,7 +155,7 @@ def _play_all(config: EvaluateConfig, terms: Terms, name: str) -> list[Group]:
 
 
 def _summary(
-    config: EvaluateConfig, terms: Terms, manifest: Manifest, episodes: list[Episode], shared_violations: int
+    config: EvaluateConfig, terms: Terms, manifest: Manifest, episodes: list[Episode], groups: list[Group]
 ) -> Evaluation:
     returns = np.array([episode.total for episode in episodes])
     origin = manifest.provenance
@@ -169,7 +171,7 @@ def _summary(
         return_stderr=float(returns.std() / np.sqrt(len(returns))),
         soft_cost_pct=_frame_mean_pct(episodes, "soft_cost"),
         hard_cost_pct=_frame_mean_pct(episodes, "hard_cost"),
-        violations=shared_violations + sum(episode.violations for episode in episodes),
+        violations=sum(played.violations for played in (*groups, *episodes)),
         frames_mean=float(np.mean([episode.frames for episode in episodes])),
         terminated_pct=100.0 * float(np.mean([episode.terminated for episode in episodes])),
         method=manifest.method,
@@ -180,7 +182,27 @@ def _summary(
         target_cost=terms.target_cost,
         frame_budget=terms.frame_budget,
         bots=terms.bots,
+        normalised_mean=_normalised(float(returns.mean()), origin.get("reference_returns")),
+        acquired_pct=_acquired_pct(config.bundle / FEATURE_MAP, episodes, groups),
     )
+
+
+def _normalised(value: float, references: str | None) -> float | None:
+    """D4RL's score of a return: 0 and 100 at the two references, `low high`."""
+    if references is None:
+        return None
+    low, high = map(float, references.split())
+    return 100.0 * (value - low) / (high - low)
+
+
+def _acquired_pct(file: Path, episodes: list[Episode], groups: list[Group]) -> dict[str, float]:
+    """Of each named group of features, how many were acquired in a frame, %. A map without groups has none."""
+    if not file.exists():
+        return {}
+    frames = sum(episode.frames for episode in episodes)
+    rates_M = 100.0 * sum(group.acquired_M for group in groups) / frames
+    kinds = np.array(FeatureMap.read(file).groups)
+    return {str(kind): float(rates_M[kinds == kind].mean()) for kind in dict.fromkeys(kinds) if kind}
 
 
 def _frame_mean_pct(episodes: list[Episode], name: str) -> float:

@@ -59,6 +59,7 @@ class Group:
 
     episodes: list[Episode]
     violations: int  # frames in which all bots together passed the budget that they shared
+    acquired_M: NDArray[np.int64]  # how often each feature was acquired
     heat: HeatSums | None
 
 
@@ -80,18 +81,19 @@ class Player:
         waiting, live, episodes = deque(seeds), list[_Game](), list[Episode]()
         bots = Bots(self._bundle, max_bots=min(self._terms.bots, len(seeds)))
         heat = HeatSums(self._bundle.manifest.features.n_queries) if self._terms.with_heat_map else None
+        acquired_M = np.zeros(self._bundle.manifest.features.n_queries, dtype=np.int64)
         frame = violations = 0
         while waiting or live:
             while waiting and len(live) < bots.max_bots:
                 live.append(self._begin(bots, waiting.popleft()))
-            violations += self._turn(bots, frame, live, heat)
+            violations += self._turn(bots, frame, live, acquired_M, heat)
             for game in live:
                 if game.over:
                     bots.stop(game.handle)
                     self._idle.append(game.environment)
                     episodes.append(game.episode())
             live, frame = [game for game in live if not game.over], frame + 1
-        return Group(episodes, violations, heat)
+        return Group(episodes, violations, acquired_M, heat)
 
     def _begin(self, bots: Bots, seed: int) -> _Game:
         target = self._terms.target_cost
@@ -102,7 +104,9 @@ class Player:
             self._idle.append(open_environment(self._terms.environment, owner_D, self._feature_map))
         return _Game(seed, handle, self._idle.pop())
 
-    def _turn(self, bots: Bots, frame: int, live: list[_Game], heat: HeatSums | None) -> bool:
+    def _turn(
+        self, bots: Bots, frame: int, live: list[_Game], acquired_M: NDArray[np.int64], heat: HeatSums | None
+    ) -> bool:
         """One frame of every live bot. Returns whether together they passed the frame's budget."""
         handles = np.concatenate([game.handle for game in live])
         free = np.stack([game.environment.free() for game in live])
@@ -111,6 +115,7 @@ class Player:
         queries = bots.request_queries(handles, frame, free, rewards, frame_budget_us=frame_us)
         costly = np.stack([game.environment.acquire(q) for game, q in zip(live, queries.query_NM, strict=True)])
         actions = bots.submit_features(handles, frame, queries.query_NM, costly)
+        acquired_M += queries.query_NM.sum(axis=0)
         probs_NM = np.nan_to_num(queries.probs_NM)
         if heat is not None:
             heat.add(np.array([game.frames for game in live]), probs_NM)
