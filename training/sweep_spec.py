@@ -1,7 +1,7 @@
 """What a sweep is: a JSON file of settings, read into the runs that it stands for. No files but that one are touched.
 
     {"out": "runs/navigation", "base": {settings}, "grid": [{block}, ...],
-     "evaluate": {"episodes": 256, "costs": [0.5, 0.1, 0.01], "heat_map": false}}
+     "evaluate": {"episodes": 256, "costs": [0.5, 0.1, 0.01], "heat_map": 0.1}}
 
 A block gives each setting of TrainConfig one value or a list of values, and stands for every combination of them, the
 last setting varying fastest. A setting that is itself a list (bins, budgets, sampled) varies as a list of lists.
@@ -41,7 +41,7 @@ class EvaluateSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     episodes: int = 256
     costs: tuple[float, ...] = (0.5, 0.1, 0.01)  # C of a budget-conditioned network; others have their own
     kinds: tuple[Literal["soft", "hard"], ...] = ("soft", "hard")  # without a cap, and with what a frame shares capped
-    heat_map: bool = False  # of the evaluation without caps whose C is nearest the run's budget
+    heat_map: float | None = None  # C of the evaluation without caps that draws one; None: none does
 
     def __post_init__(self) -> None:
         labels = [f"{cost:g}" for cost in self.costs]
@@ -179,7 +179,6 @@ def _evaluations(config: TrainConfig, asked: EvaluateSpec) -> dict[str, Evaluate
     forced = {"all": 1.0, "none": 0.0}.get(config.acquisition)
     conditioned = forced is None and bool(config.budgets)
     costs = asked.costs if conditioned else (config.budget if forced is None else forced,)
-    nearest = min(costs, key=lambda cost: abs(cost - config.budget))
     evaluations = {}
     for cost, kind in itertools.product(costs, ("soft",) if forced is not None else asked.kinds):
         label = f"{kind}-{cost:g}"
@@ -193,6 +192,6 @@ def _evaluations(config: TrainConfig, asked: EvaluateSpec) -> dict[str, Evaluate
             bots=_SHARING_BOTS,
             workers=1,  # as many as the run has threads, once it runs
             out=config.out / "evaluations" / f"{label}.json",
-            heat_map=config.out / "heat_map.npz" if asked.heat_map and kind == "soft" and cost == nearest else None,
+            heat_map=config.out / "heat_map.npz" if kind == "soft" and cost == asked.heat_map else None,
         )
     return evaluations
