@@ -15,7 +15,7 @@ import msgspec
 
 from protocol.errors import BadJson, BadMsgpack, BadSchema, ProtocolError, TooDeep
 from protocol.features import FeatureTable
-from protocol.messages import MAX_BOTS_PER_MESSAGE, Reply, Request
+from protocol.messages import MAX_BOTS_PER_MESSAGE, Request
 
 __all__ = ["MAX_DETAIL_CHARS", "Format", "body_limit", "decode", "decode_request", "encode"]
 
@@ -65,9 +65,9 @@ def decode_request(body: bytes, form: Format) -> Request:
     return cast("Request", _decode(body, form, Request))
 
 
-def encode(reply: Reply | Request, form: Format) -> bytes:
+def encode(message: msgspec.Struct, form: Format) -> bytes:
     """The bytes of one message. Its blobs must already be in this format (`protocol.arrays`)."""
-    return msgspec.msgpack.encode(reply) if form is Format.MSGPACK else msgspec.json.encode(reply)
+    return msgspec.msgpack.encode(message) if form is Format.MSGPACK else msgspec.json.encode(message)
 
 
 @cache
