@@ -82,9 +82,10 @@ def open_dataset(path: Path, feature_map: FeatureMap | None = None) -> Dataset:
         action = _action(metadata, acted)
         features = _features(metadata, sizes) if feature_map is None else feature_map.table(sizes)
         choices = int(acted["n"]) if acted["type"] == "Discrete" else None
+        opened = minari.MinariDataset(folder / "data")
     except (KeyError, TypeError, ValueError) as error:
         raise TracesError(f"{folder}: metadata: {_reason(error)}") from error
-    return Dataset(folder, features, action, choices, minari.MinariDataset(folder / "data"), feature_map)
+    return Dataset(folder, features, action, choices, opened, feature_map)
 
 
 def observation_sizes(path: Path) -> dict[str, int]:

@@ -25,7 +25,7 @@ from training.sweep_spec import SweepSpec
 
 pytestmark = pytest.mark.timeout(300)  # each run imports torch and exports: long on a busy machine
 
-EVALUATE: dict[str, object] = {"episodes": 3, "heat_map": True}
+EVALUATE: dict[str, object] = {"episodes": 3, "heat_map": 0.2}
 DONE = ["bdt-learned-test-v0-c0_2-s0", "bdt-all-test-v0-s0"]
 BROKEN = "bdt-learned-nothing-v0-c0_1-s0"
 
@@ -36,7 +36,7 @@ def spec(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     grid: list[dict[str, object]] = [
         {"environment": TOY, "budget": [0.2]},
         {"dataset": str(dataset.parent / "nothing-v0")},
-        {"environment": TOY, "acquisition": ["all"], "evaluate": {"heat_map": False}},
+        {"environment": TOY, "acquisition": ["all"], "evaluate": {"heat_map": None}},
     ]
     return write_spec(tmp_path_factory.mktemp("sweep"), dataset, grid, EVALUATE)
 

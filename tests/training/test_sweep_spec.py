@@ -74,17 +74,17 @@ def test_evaluations_are_those_that_fit_the_network() -> None:
         "soft-0.02",
         "hard-0.02",
     ]
+    assert labels(budget=0.01, evaluate={"kinds": ["soft"]}) == ["soft-0.01"]
     assert labels(environment="") == []
 
 
 def test_evaluations_ask_for_what_their_label_says() -> None:
-    (run,) = runs({"budgets": [0.01, 0.5]}, evaluate={"episodes": 7, "costs": [0.5, 0.05], "heat_map": True})
+    (run,) = runs({"budgets": [0.01, 0.5]}, evaluate={"episodes": 7, "costs": [0.5, 0.05], "heat_map": 0.05})
     soft, hard = run.evaluations["soft-0.05"], run.evaluations["hard-0.05"]
     assert (soft.target_cost, soft.budget, soft.frame_budget) == (0.05, 1.0, None)
     assert (hard.target_cost, hard.budget, hard.frame_budget, hard.bots) == (0.05, 1.0, 0.05, 32)
     assert soft.episodes == hard.episodes == 7
     assert soft.out == run.config.out / "evaluations" / "soft-0.05.json"
-    # The run's own budget is 0.1: one heat map, of the C nearest to it.
     assert [label for label, asked in run.evaluations.items() if asked.heat_map] == ["soft-0.05"]
     (fixed,) = runs({"budget": 0.2})
     assert [(asked.target_cost, asked.frame_budget) for asked in fixed.evaluations.values()] == [

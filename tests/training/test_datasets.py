@@ -1,0 +1,165 @@
+"""Datasets that know nothing of this project: opened by a feature map, trained on, exported and played as a bundle."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+import pytest
+
+from tests.training.balance import CARTPOLE, write_cartpole
+from training.config import TrainConfig
+from training.datasets import TracesError, observation_sizes, open_dataset
+from training.draft_map import DraftConfig, draft_map
+from training.environments import open_environment
+from training.evaluate import EvaluateConfig, evaluate
+from training.export import ExportConfig, export
+from training.feature_map import FeatureMap, MappedFeature
+from training.traces import load_traces
+from training.train import train
+
+MAP = FeatureMap(
+    (
+        MappedFeature("place", (0, 2)),
+        MappedFeature("speeds", (1, 3), cost_us=5.0, group="exact"),
+        MappedFeature("rough_speeds", (1, 3), cost_us=1.0, noise=0.2, group="rough"),
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def cartpole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        return write_cartpole(tmp_path_factory.mktemp("datasets"), monkeypatch)
+
+
+def test_a_map_finds_the_features(cartpole: Path) -> None:
+    dataset = open_dataset(cartpole, MAP)
+    recorded, read = minari.MinariDataset(cartpole / "data")[3], dataset.episode(3)
+    np.testing.assert_array_equal(read.free_TF, recorded.observations[:-1, [0, 2]])
+    np.testing.assert_array_equal(read.costly_TD[:, :2], recorded.observations[:-1, [1, 3]])
+    assert read.actions_TA.tolist() == recorded.actions[:, None].tolist()
+    assert dataset.choices == 2
+    assert [(one.name, one.low, one.high) for one in dataset.action.components] == [("choice", 0.0, 1.0)]
+    np.testing.assert_array_equal(dataset.episode(3).costly_TD, read.costly_TD)  # noise is drawn once
+
+
+def test_an_id_is_found_where_minari_keeps_it(cartpole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(cartpole.parents[1]))
+    assert len(open_dataset(Path("cartpole/test-v0"), MAP)) == 12
+    with pytest.raises(TracesError, match="minari download cartpole/other-v0"):
+        open_dataset(Path("cartpole/other-v0"), MAP)
+
+
+def test_a_dataset_that_tells_no_features_needs_a_map(cartpole: Path) -> None:
+    assert observation_sizes(cartpole) == {"": 4}
+    with pytest.raises(TracesError, match="tells no features: give a feature map"):
+        load_traces(cartpole)
+    with pytest.raises(TracesError, match="has number 7, the observation has 0 to 3"):
+        load_traces(cartpole, feature_map=FeatureMap((MappedFeature("a", (7,)),)))
+
+
+@pytest.mark.parametrize(
+    ("key", "space", "message"),
+    [
+        ("action_space", {"type": "Discrete", "n": 3}, "there is no 'start'"),
+        ("observation_space", {"type": "Discrete", "n": 4}, "is a Discrete, expected a Box"),
+        ("observation_space", [], r"found '\[\]', expected an object"),
+        ("action_space", {"type": "MultiDiscrete", "nvec": [2, 2]}, "expected Discrete or a flat Box"),
+        ("action_space", {"type": "Box", "shape": [1], "low": [float("-inf")], "high": [1.0]}, "expected finite"),
+    ],
+)
+def test_refuses_spaces_that_it_cannot_serve(
+    cartpole: Path, tmp_path: Path, key: str, space: object, message: str
+) -> None:
+    metadata = json.loads((cartpole / "data" / "metadata.json").read_text())
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "metadata.json").write_text(json.dumps(metadata | {key: json.dumps(space)}))
+    with pytest.raises(TracesError, match=message):
+        open_dataset(tmp_path, MAP)
+
+
+def test_several_datasets_are_read_in_turn(cartpole: Path) -> None:
+    alone, twice = load_traces(cartpole, feature_map=MAP), load_traces(cartpole, cartpole, episodes=2, feature_map=MAP)
+    assert twice.lengths_E.tolist() == [60, 60, 60, 60]
+    assert (twice.free_SF[:60] == twice.free_SF[60:120]).all()
+    assert (twice.free_SF[120:180] == alone.free_SF[60:120]).all()
+
+
+def test_refuses_datasets_with_other_actions(cartpole: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other-v0"
+    shutil.copytree(cartpole, other)
+    file = other / "data" / "metadata.json"
+    metadata = json.loads(file.read_text())
+    file.write_text(json.dumps(metadata | {"action_space": json.dumps({"type": "Discrete", "dtype": "int64", "n": 3, "start": 0})}))
+    with pytest.raises(TracesError, match="have other features or other actions"):
+        load_traces(cartpole, other, feature_map=MAP)
+
+
+def test_a_bundle_of_another_environment_is_played_through_the_runtime(cartpole: Path, tmp_path: Path) -> None:
+    MAP.write(tmp_path / "map.json")
+    config = TrainConfig(
+        dataset=cartpole, out=tmp_path / "run", name="pole", environment=CARTPOLE, feature_map=tmp_path / "map.json",
+        reference_returns=(0.0, 500.0), bins=(2,), budget=0.5, frame_budget=1.0, fourier=0, context_length=5, window=20,
+        width=16, n_heads=2, encoder_width=32, batch=32, updates=60, learning_rate=5e-3, log_every=20,
+    )  # fmt: skip
+    train(config)
+    bundle = export(ExportConfig(tmp_path / "run", tmp_path / "pole"))
+    assert [feature.name for feature in bundle.manifest.features.costly] == ["speeds", "rough_speeds"]
+    evaluation, episodes = evaluate(EvaluateConfig(tmp_path / "pole", episodes=6, workers=1))
+    assert evaluation.return_mean > 60.0, "a random player lasts for 22 steps"
+    assert evaluation.normalised_mean == pytest.approx(evaluation.return_mean / 5.0)
+    assert set(evaluation.acquired_pct) == {"exact", "rough"}
+    spent = (5.0 * evaluation.acquired_pct["exact"] + evaluation.acquired_pct["rough"]) / 6.0
+    assert evaluation.hard_cost_pct == pytest.approx(spent)
+    assert {episode.violations for episode in episodes} == {0}
+
+
+def test_what_is_played_has_noise_that_follows_the_episode() -> None:
+    owner_D = MAP.table({"": 4}).owner
+    first, second = open_environment(CARTPOLE, owner_D, MAP), open_environment(CARTPOLE, owner_D, MAP)
+    asked = np.array([True, True])
+    for env in (first, second):
+        env.restart(5)
+    np.testing.assert_array_equal(first.acquire(asked), second.acquire(asked))
+    exact, rough = first.acquire(asked)[:2], first.acquire(asked)[2:]
+    assert not np.array_equal(exact, rough)
+    state = gymnasium.make(CARTPOLE).reset(seed=5)[0]
+    np.testing.assert_array_equal(first.free(), state[[0, 2]])
+    assert first.advance(np.array([1.0], np.float32)).reward == 1.0
+
+
+def test_a_draft_has_every_number_and_its_copies(cartpole: Path, tmp_path: Path) -> None:
+    plain = draft_map(DraftConfig(cartpole, tmp_path / "map.json", cost_us=2.5))
+    assert [(one.name, one.numbers, one.cost_us) for one in plain.features][:2] == [
+        ("number_0", (0,), 2.5),
+        ("number_1", (1,), 2.5),
+    ]
+    copies = ("exact:20:0", "low:5:0.1")
+    drafted = draft_map(DraftConfig(cartpole, tmp_path / "map.json", names=("x", "v", "angle", "spin"), copies=copies))
+    assert [one.name for one in drafted.features][3:5] == ["spin_exact", "x_low"]
+    recorded = np.concatenate([episode.observations[:-1] for episode in minari.MinariDataset(cartpole / "data")])
+    noise = [one.noise for one in drafted.features if one.group == "low"]
+    assert noise == pytest.approx((0.1 * recorded.std(axis=0)).tolist(), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"names": ("x",)}, "names are 1, the observation has 4 numbers"),
+        ({"copies": ("exact:20",)}, "copy 'exact:20' is not group:cost_us:noise"),
+    ],
+)
+def test_a_draft_refuses(cartpole: Path, tmp_path: Path, settings: dict[str, tuple[str, ...]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        draft_map(DraftConfig(cartpole, tmp_path / "map.json", **settings))
+
+
+def test_a_draft_overwrites_nothing(cartpole: Path, tmp_path: Path) -> None:
+    (tmp_path / "map.json").write_text("mine")
+    with pytest.raises(ValueError, match=r"map\.json exists"):
+        DraftConfig(cartpole, tmp_path / "map.json")
