@@ -30,7 +30,7 @@ _LEAST_PCT = 0.01  # the logarithmic axis never begins before; what spends less 
 _OFFSETS = ((3, 4), (3, -9), (-13, 4), (-13, -9))  # points between a point and its C, another for each series
 _COLOURS = dict(zip(METHODS, colormaps["tab10"].colors, strict=False))  # type: ignore[attr-defined]
 _DASHES = ("-", "--", ":", "-.")
-_MARKERS = {"BDT": "o", "RCBC": "s"}  # of the paper's points
+_MARKERS = {"BDT": "o", "RCBC": "s", "BDT random": "D"}  # of the paper's points
 _SIDE_DEG = 45  # directions that are labelled
 _RAY = re.compile(r"ray_(?P<side>[lr])(?P<azimuth>\d+)_(?P<tilt>[du])(?P<pitch>\d+)_r(?P<range>\d+)")
 
@@ -59,7 +59,7 @@ def performance_figure(measurements: Sequence[Measurement], setting: Setting, pa
         each.set_title(f"{setting}, {title}", fontsize=10)
         each.grid(alpha=0.2, which="both")
     _draw_paper(axes[0], setting, paper)
-    axes[0].set_ylabel("return")
+    axes[0].set_ylabel("normalised return" if any(one.is_normalised for one in measurements) else "return")
     handles = {label: handle for each in axes for handle, label in zip(*each.get_legend_handles_labels(), strict=True)}
     if handles:
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=8)
@@ -113,7 +113,7 @@ def _draw_series(axes: Axes, measurements: Iterable[Measurement], least_pct: flo
     for (series, colour, dash), offset in zip(_styles({one.run.series for one in learned}), cycle(_OFFSETS)):
         groups = by_constraint(one for one in learned if one.run.series == series)
         spends = [statistic([one.spend_pct for one in group]) for group in groups.values()]
-        returns = [statistic([one.numbers.return_mean for one in group]) for group in groups.values()]
+        returns = [statistic([one.value for one in group]) for group in groups.values()]
         x = np.maximum([spend.mean for spend in spends], least_pct)
         y = np.array([value.mean for value in returns])
         along = np.argsort(x, kind="stable")
@@ -135,7 +135,7 @@ def _draw_forced(axes: Axes, measurements: Iterable[Measurement]) -> None:
     forced = [one for one in measurements if one.constraint in (BASE, NO_RAYS)]
     for series, colour, _ in _styles({one.run.series for one in forced}):
         for constraint, group in by_constraint(one for one in forced if one.run.series == series).items():
-            value = statistic([one.numbers.return_mean for one in group])
+            value = statistic([one.value for one in group])
             if constraint == BASE:
                 axes.errorbar(
                     [100.0], [value.mean], [value.std or 0.0], color=colour, marker="*", markersize=9, linestyle="none",
@@ -149,7 +149,7 @@ def _draw_paper(axes: Axes, setting: Setting, paper: PaperTable) -> None:
     for method, marker in _MARKERS.items():
         points = [point for (where, name, _), point in paper.items() if (where, name) == (setting, method)]
         if points:
-            x, y, std = zip(*points, strict=True)
+            x, y, std = zip(*(point[:3] for point in points), strict=True)
             axes.errorbar(
                 x, y, std, linestyle="none", marker=marker, markersize=7, capsize=2,
                 color=_COLOURS[method], markerfacecolor="none", alpha=0.6, label=f"{method}, the paper's",

@@ -18,10 +18,11 @@ from matplotlib.figure import Figure
 
 from training.curves import training_figure
 from training.figures import LEAST_ALIVE, Panel, heat_map_figure, performance_figure
+from training.group_table import group_table
 from training.heat_map import HeatMap
 from training.paper import PaperTable, read_paper
 from training.results import Kind, Measurement, Results, Run, Setting
-from training.tables import navigation_table, spend_table
+from training.tables import cost_table, spend_table
 
 __all__ = ["ReportConfig", "report"]
 
@@ -30,6 +31,7 @@ _HEAD = """# Results
 `soft` is what the network asks for where nothing is capped; `hard` is one frame budget of C, shared by all bots that
 play at once, and shows what it allowed of what was asked for. R is the mean return. ± is the sample standard deviation
 over training seeds, n of them; one seed has none. Costs are shares of the cost of all features, averaged over frames.
+Where a run has reference returns R is normalised: they are 0 and 100.
 """
 _PAPER = "\nFigures in *italics* and hollow markers are the paper's own, measured in its own environment.\n"
 _SAME_COST = 1e-4  # relative: a heat map is rounded to float32, and no two evaluations spend the same
@@ -40,7 +42,7 @@ class ReportConfig:
     """What is reported, and where to."""
 
     results: tyro.conf.Positional[Path]  # folder of run folders
-    paper: Path | None = None  # the paper's navigation table as CSV (None: without the paper's figures)
+    paper: tuple[Path, ...] = ()  # tables of the paper as CSV (none: without the paper's figures)
     out: Path | None = None  # folder of report.md and figures/ (None: `report` in the folder of results)
     spends: tuple[float, ...] = (1.0, 2.0, 2.9, 5.0, 10.0)  # % of the full cost, for returns at equal spend
 
@@ -52,7 +54,7 @@ class ReportConfig:
 def report(config: ReportConfig) -> Path:
     """Write everything; the path of report.md. Raises ValueError naming a file that is not as it should be."""
     results = Results.read(config.results)
-    paper = read_paper(config.paper) if config.paper is not None else {}
+    paper = read_paper(*config.paper)
     out = config.out or config.results / "report"
     (out / "figures").mkdir(parents=True, exist_ok=True)
     parts = [_HEAD + (_PAPER if paper else "")]
@@ -73,8 +75,12 @@ def _setting(
     measurements = results.of(setting)
     runs = [run for run in results.runs if run.setting == setting]
     yield "### Cost and return\n"
-    yield navigation_table(measurements, setting, paper)
+    yield cost_table(measurements, setting, paper)
     yield f"{_measured(measurements)} {_violations(measurements)}\n"
+    if groups := group_table(measurements, setting, paper):
+        yield "### Features of each group\n"
+        yield "Mean share of a group's features that are acquired in a frame; nothing is capped.\n"
+        yield groups
     if measurements:
         yield from _at_equal_spend(measurements, setting, paper, spends)
         caption = (

@@ -27,19 +27,27 @@ _DATASET = re.compile(r"(?P<map>[a-z0-9]+)-(?P<quality>[a-z0-9]+)-v\d+")
 
 
 class Setting(NamedTuple):
-    """What is played: a map, and the players that the traces are of."""
+    """What is played: a map or environment, the players that the traces are of, and what can be known of it."""
 
     map: str
     dataset: str
+    features: str = ""  # which feature map, where an environment has several
 
     def __str__(self) -> str:
-        return " ".join(part for part in (self.map, self.dataset) if part)
+        return " ".join(part for part in self if part)
 
     @classmethod
-    def of(cls, dataset: str) -> Setting:
-        """`hard-expert-v0` is the map hard and the dataset expert; another name is a dataset without a map."""
-        match = _DATASET.fullmatch(dataset)
-        return cls(match["map"], match["quality"]) if match else cls("", dataset)
+    def of(cls, config: TrainConfig) -> Setting:
+        """`hard-expert-v0` is the map hard and the dataset expert; with `hard-medium-v0` it is medium-expert. Another
+        name is a dataset without a map. `hard-noisy.json` are the features noisy of the map hard."""
+        matches = [_DATASET.fullmatch(path.name) for path in (config.dataset, *config.more_datasets)]
+        maps = {match["map"] for match in matches if match}
+        if len(maps) != 1 or not all(matches):
+            return cls("", config.dataset_name)
+        (map_,) = maps
+        qualities = "-".join(sorted((match["quality"] for match in matches if match), reverse=True))
+        stem = "" if config.feature_map is None else config.feature_map.stem
+        return cls(map_, qualities, "" if stem == map_ else stem.removeprefix(f"{map_}-"))
 
 
 class Series(NamedTuple):
@@ -79,7 +87,7 @@ class Run:
 
     @property
     def setting(self) -> Setting:
-        return Setting.of(self.config.dataset.name)
+        return Setting.of(self.config)
 
 
 class _Numbers(msgspec.Struct, frozen=True):
@@ -92,6 +100,7 @@ class _Numbers(msgspec.Struct, frozen=True):
     violations: int
     trained_budget: float | None
     target_cost: float | None
+    acquired_pct: dict[str, float] = {}  # none before groups were counted
 
 
 @dataclass(frozen=True)
@@ -106,6 +115,19 @@ class Measurement:
     @property
     def seed(self) -> int:
         return self.run.config.seed
+
+    @property
+    def value(self) -> float:
+        """The mean return, normalised where the run has reference returns: they are 0 and 100."""
+        references = self.run.config.reference_returns
+        if references is None:
+            return self.numbers.return_mean
+        return 100.0 * (self.numbers.return_mean - references[0]) / (references[1] - references[0])
+
+    @property
+    def is_normalised(self) -> bool:
+        """Whether `value` is on the scale of reference returns."""
+        return self.run.config.reference_returns is not None
 
     @property
     def spend_pct(self) -> float:

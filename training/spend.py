@@ -69,7 +69,7 @@ def at_spend(spend_pct: float, measurements: Iterable[Measurement]) -> Statistic
     curves: dict[int, list[tuple[float, float]]] = defaultdict(list)
     for one in measurements:
         if one.constraint not in (BASE, NO_RAYS):
-            curves[one.seed].append((one.spend_pct, one.numbers.return_mean))
+            curves[one.seed].append((one.spend_pct, one.value))
     reached = [value for curve in curves.values() if (value := return_at(spend_pct, curve)) is not None]
     return statistic(reached) if reached else None
 

@@ -1,4 +1,4 @@
-"""Tables of a report in Markdown: the paper's navigation table with our cells beside it, and returns at equal spend.
+"""Tables of a report in Markdown: the paper's tables with our cells beside theirs, and returns at equal spend.
 
 A cell that was not measured says so; nothing is filled in. This module knows nothing about files or figures.
 """
@@ -11,25 +11,24 @@ from training.paper import PaperTable
 from training.results import BASE, NO_RAYS, Constraint, Kind, Measurement, Series, Setting
 from training.spend import Statistic, at_spend, return_at, statistic
 
-__all__ = ["METHODS", "columns", "navigation_table", "number", "spend_table"]
+__all__ = ["METHODS", "columns", "constraint_name", "cost_table", "markdown", "number", "spend_table"]
 
 METHODS = ("BDT", "RCBC", "BC", "IQL", "BDT random", "BDT conditioned")
-_ROWS: tuple[Constraint, ...] = (BASE, 0.5, 0.1, 0.01, 0.0)  # the paper's
 _NOT_MEASURED = "not measured"
 _DASH = "–"
 
 
-def navigation_table(measurements: Sequence[Measurement], setting: Setting, paper: PaperTable) -> str:
-    """One map and dataset in the paper's layout. Rows that the paper does not have appear where they were measured."""
+def cost_table(measurements: Sequence[Measurement], setting: Setting, paper: PaperTable) -> str:
+    """One map and dataset in the paper's layout: its rows, and those that were measured."""
     series = columns(measurements)
     rows = [["C", *(str(one) for one in series)]]
-    for constraint in _constraints(measurements):
+    for constraint in _constraints(measurements, setting, paper):
         cells = [_cell(_measured(measurements, one, constraint), constraint) for one in series]
         rows.append([constraint_name(constraint), *cells])
         theirs = [_paper_cell(paper, setting, one, constraint) for one in series]
         if any(cell != _DASH for cell in theirs):
             rows.append([f"*paper, {constraint_name(constraint)}*", *theirs])
-    return _markdown(rows)
+    return markdown(rows)
 
 
 def spend_table(
@@ -52,7 +51,7 @@ def spend_table(
         values = [return_at(spend, points) for spend in spends_pct]
         cells = [_DASH if value is None else f"*{value:.1f}*" for value in values]
         rows.append([f"*{method}, paper's means*", *cells])
-    return _markdown(rows)
+    return markdown(rows)
 
 
 def columns(measurements: Iterable[Measurement]) -> list[Series]:
@@ -80,9 +79,10 @@ def number(stat: Statistic, decimals: int = 1) -> str:
     return f"{stat.mean:.{decimals}f} ± {stat.std:.{decimals}f} (n={stat.n})"
 
 
-def _constraints(measurements: Sequence[Measurement]) -> list[Constraint]:
+def _constraints(measurements: Sequence[Measurement], setting: Setting, paper: PaperTable) -> list[Constraint]:
     measured = {one.constraint for one in measurements}
-    shares = {one for one in {*measured, *_ROWS} if not isinstance(one, str)}
+    theirs = {constraint for where, _, constraint in paper if where == setting}
+    shares = {one for one in {*measured, *theirs} if not isinstance(one, str)}
     last: list[Constraint] = [NO_RAYS] if NO_RAYS in measured else []
     return [BASE, *sorted(shares - {1.0}, reverse=True), *last]  # C = 1 is the base
 
@@ -112,7 +112,7 @@ def _reading(cell: Sequence[Measurement], kind: Kind) -> str:
     asked = _percent(statistic([one.numbers.soft_cost_pct for one in cell]).mean)
     allowed = _percent(statistic([one.numbers.hard_cost_pct for one in cell]).mean)
     cost = asked if kind == "soft" else f"{allowed} of {asked} asked"
-    return rf"{kind} {cost} \| R = {number(statistic([one.numbers.return_mean for one in cell]))}"
+    return rf"{kind} {cost} \| R = {number(statistic([one.value for one in cell]))}"
 
 
 def _paper_cell(paper: PaperTable, setting: Setting, series: Series, constraint: Constraint) -> str:
@@ -128,7 +128,8 @@ def _percent(share_pct: float) -> str:
     return f"{share_pct:.1f} %" if share_pct >= 0.95 or share_pct == 0.0 else f"{share_pct:.2g} %"
 
 
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """A table whose first row is its head."""
     head, *body = rows
     lines = [head, ["---"] * len(head), *body]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"

@@ -45,8 +45,29 @@ def test_a_series_is_a_method_and_what_is_not_as_printed(
     assert Results.read(tmp_path).runs[0].series == series
 
 
-def test_a_dataset_that_is_not_navigation_has_no_map() -> None:
-    assert Setting.of("d4rl_halfcheetah") == Setting("", "d4rl_halfcheetah")
+@pytest.mark.parametrize(
+    ("dataset", "settings", "setting"),
+    [
+        ("hard-expert-v0", {}, Setting("hard", "expert")),
+        ("d4rl_halfcheetah", {}, Setting("", "d4rl_halfcheetah")),
+        ("hopper-expert-v0", {"more_datasets": (Path("hopper-medium-v0"),)}, Setting("hopper", "medium-expert")),
+        ("hopper-expert-v0", {"more_datasets": (Path("mine"),)}, Setting("", "hopper-expert-v0+mine")),
+        ("hopper-expert-v0", {"feature_map": Path("maps/hopper.json")}, Setting("hopper", "expert")),
+        ("hopper-expert-v0", {"feature_map": Path("maps/hopper-nl.json")}, Setting("hopper", "expert", "nl")),
+    ],
+)
+def test_a_setting_is_what_is_played(
+    tmp_path: Path, dataset: str, settings: dict[str, object], setting: Setting
+) -> None:
+    write_run(tmp_path, "run", dataset, **settings)
+    assert Results.read(tmp_path).runs[0].setting == setting
+
+
+def test_reference_returns_are_0_and_100(tmp_path: Path) -> None:
+    for name, references in (("raw", None), ("normalised", (-10.0, 90.0))):
+        write_evaluation(write_run(tmp_path / name, "run", reference_returns=references), "soft-0.1", 40.0, 9.0, 9.0)
+    values = {name: Results.read(tmp_path / name).measurements[0].value for name in ("raw", "normalised")}
+    assert values == {"raw": 40.0, "normalised": 50.0}
 
 
 def test_two_networks_of_one_cell_are_no_two_seeds(tmp_path: Path) -> None:
