@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tempfile
 import tracemalloc
 from pathlib import Path
@@ -60,7 +61,7 @@ ACTIONS = st.tuples(st.floats(-1, 1, width=32), st.floats(-(2.0**127), 2.0**127,
 STEPS = st.lists(st.tuples(NUMBERS, NUMBERS, ACTIONS, NUMBERS), min_size=1, max_size=5)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.dictionaries(NAMES, st.tuples(STEPS, st.booleans(), st.booleans()), min_size=1, max_size=4))
 def test_every_format_gives_the_arrays_that_were_logged(
     episodes: dict[str, tuple[list[tuple[Any, ...]], bool, bool]],
@@ -233,3 +234,16 @@ def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
         main(["log.jsonl", "arena-v0", "--columns", "columns.json"])
     with pytest.raises(SystemExit, match=r"error: .*No such file or directory: 'other.json'"):
         main(["log.jsonl", "other-v0", "--columns", "other.json"])
+
+
+def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
+    """A log and the map that follows it, twice."""
+    text = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
+    maps = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    lengths = []
+    for suffix, columns in zip(("csv", "jsonl"), maps, strict=True):
+        (log,) = re.findall(rf"```{suffix}\n(.*?)```", text, re.DOTALL)
+        source = tmp_path / f"log.{suffix}"
+        source.write_text(log)
+        lengths.append(imported(tmp_path, source, msgspec.json.decode(columns, type=ColumnMap))[0].lengths)
+    assert lengths == [(2, 3), (2,)]

@@ -108,3 +108,11 @@ def test_an_endless_line_is_not_read_to_its_end(tmp_path: Path, read: Callable) 
 
 def test_the_limit_of_a_cell_is_that_of_the_csv_module() -> None:
     assert csv.field_size_limit() == 131_072
+
+
+def test_long_lines_make_short_batches(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(HEADER + (b"a,1,2,3," + b"x" * 100_000 + b"\n") * 100)
+    sizes = [len(batch.rows) for batch in csv_rows(path, COLUMNS)]
+    assert sum(sizes) == 100
+    assert max(sizes) == 42, "4 MiB of text"
