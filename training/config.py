@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +13,7 @@ import msgspec
 __all__ = ["TrainConfig"]
 
 
+_DATASET = re.compile(r"(?P<map>[a-z0-9]+)-(?P<quality>[a-z0-9-]+)-v\d+")
 _COUNTS = ("window", "width", "n_layers", "n_heads", "encoder_width", "batch", "updates", "warmup", "sweeps")
 _COUNTS += ("frame_bots", "log_every", "checkpoint_every")
 
@@ -20,7 +22,7 @@ _COUNTS += ("frame_bots", "log_every", "checkpoint_every")
 class TrainConfig:
     """One run of Algorithm 1. Lengths in timesteps, costs as shares of the full cost. Raises ValueError."""
 
-    dataset: Path  # Minari dataset folder, such as data/navigation/navigation/hard-expert-v0
+    dataset: Path  # Minari dataset folder, such as data/navigation/navigation/hard-expert-v0; or one of training.shards
     out: Path  # folder of the run: config, checkpoint, metrics and curves
     name: str  # name of the bundle made from this run
     more_datasets: tuple[Path, ...] = ()  # read with it, an episode of each in turn
@@ -30,6 +32,7 @@ class TrainConfig:
     seed: int = 0
     episodes: int | None = None  # read only the first so many episodes of each dataset (None: all)
     held_out: float = 0.04  # share of the episodes, the last ones, that only measure the loss
+    pool_mb: float = 1024.0  # most memory for traces where they are streamed, from a folder of training.shards
 
     method: Literal["bdt", "rcbc", "bc", "iql"] = "bdt"
     acquisition: Literal["learned", "random", "all", "none"] = "learned"  # learn the queries, draw them, or force them
@@ -75,6 +78,8 @@ class TrainConfig:
         for name in _COUNTS:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 1 or more")
+        if not self.pool_mb > 0.0:
+            raise ValueError(f"pool_mb is {self.pool_mb}, expected above 0")
         if self.reference_returns is not None and not self.reference_returns[0] < self.reference_returns[1]:
             raise ValueError(f"reference_returns is {self.reference_returns}, expected the lower one first")
         if self.held_out == 1.0:
@@ -101,8 +106,19 @@ class TrainConfig:
 
     @property
     def dataset_name(self) -> str:
-        """`hopper-expert-v0`, or `hopper-expert-v0+hopper-medium-v0` where several are read."""
-        return "+".join(path.name for path in (self.dataset, *self.more_datasets))
+        """`hopper-expert-v0`; with `hopper-medium-v0` it is `hopper-medium-expert-v0`, as D4RL calls them."""
+        names = [path.name for path in (self.dataset, *self.more_datasets)]
+        matches = [_DATASET.fullmatch(name) for name in names]
+        if len(names) == 1 or not all(matches) or len({match["map"] for match in matches if match}) > 1:
+            return "+".join(names)
+        qualities = sorted((match["quality"] for match in matches if match), reverse=True)
+        return "-".join([names[0].partition("-")[0], *qualities, names[0].rpartition("-")[2]])
+
+    @property
+    def feature_set(self) -> str:
+        """`nl` where the feature map of a dataset `halfcheetah-...` is `halfcheetah-nl.json`, none for its own name."""
+        stem, map_ = "" if self.feature_map is None else self.feature_map.stem, self.dataset.name.partition("-")[0]
+        return "" if stem == map_ else stem.removeprefix(f"{map_}-")
 
     @classmethod
     def read(cls, path: Path) -> TrainConfig:

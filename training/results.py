@@ -23,7 +23,7 @@ BASE = "base"  # every feature, always
 NO_RAYS = "none"  # no costly feature, ever
 
 _LABEL = re.compile(r"(soft|hard)-([0-9.e+-]+)\.json")
-_DATASET = re.compile(r"(?P<map>[a-z0-9]+)-(?P<quality>[a-z0-9]+)-v\d+")
+_DATASET = re.compile(r"(?P<map>[a-z0-9]+)-(?P<quality>[a-z0-9-]+)-v\d+")
 
 
 class Setting(NamedTuple):
@@ -38,16 +38,12 @@ class Setting(NamedTuple):
 
     @classmethod
     def of(cls, config: TrainConfig) -> Setting:
-        """`hard-expert-v0` is the map hard and the dataset expert; with `hard-medium-v0` it is medium-expert. Another
-        name is a dataset without a map. `hard-noisy.json` are the features noisy of the map hard."""
-        matches = [_DATASET.fullmatch(path.name) for path in (config.dataset, *config.more_datasets)]
-        maps = {match["map"] for match in matches if match}
-        if len(maps) != 1 or not all(matches):
+        """`hard-expert-v0` is the map hard and the dataset expert; another name is a dataset without a map.
+        `hard-noisy.json` are the features noisy of the map hard."""
+        match = _DATASET.fullmatch(config.dataset_name)
+        if match is None:
             return cls("", config.dataset_name)
-        (map_,) = maps
-        qualities = "-".join(sorted((match["quality"] for match in matches if match), reverse=True))
-        stem = "" if config.feature_map is None else config.feature_map.stem
-        return cls(map_, qualities, "" if stem == map_ else stem.removeprefix(f"{map_}-"))
+        return cls(match["map"], match["quality"], config.feature_set)
 
 
 class Series(NamedTuple):

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Literal, get_origin, get_type_hints
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -28,9 +28,15 @@ from training.sweep_run import Run
 __all__ = ["EvaluateSpec", "SweepSpec"]
 
 _SETTINGS = frozenset(field.name for field in fields(TrainConfig))
-_LISTS = frozenset(name for name, kind in get_type_hints(TrainConfig).items() if get_origin(kind) is tuple)
+_LISTS = frozenset(
+    name
+    for name, kind in get_type_hints(TrainConfig).items()
+    if tuple in (get_origin(kind), *map(get_origin, get_args(kind)))  # or None
+)
 _OWN = frozenset({"out", "name"})  # the sweep gives every run its folder and its name
-_NAMED = frozenset({"method", "acquisition", "dataset", "budget", "budgets", "control", "seed"})
+_NAMED = frozenset(
+    {"feature_map", "more_datasets", "method", "acquisition", "dataset", "budget", "budgets", "control", "seed"}
+)
 _LONGEST_NAME = 64  # of a bundle (bot_runtime/manifest.py)
 _SHARING_BOTS = 32  # that play at once where they share a frame's budget
 
@@ -157,6 +163,7 @@ def _name(config: TrainConfig, tags: list[str]) -> str:
         parts.append(f"c{config.budget:g}")
     if config.control != "algorithm-1":
         parts.append(config.control)
+    parts += [config.feature_set] if config.feature_set else []
     for tag in tags:
         value = getattr(config, tag)
         text = "_".join(map(str, value)) if isinstance(value, tuple) else str(value)

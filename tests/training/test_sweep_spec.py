@@ -60,6 +60,20 @@ def test_other_settings_are_in_the_name_where_they_vary() -> None:
     assert names == [f"bdt-learned-hard-expert-v0-c0_1-{word}-bins{bins}-s0" for word, bins in kinds]
 
 
+def test_a_name_says_which_datasets_and_which_features() -> None:
+    (run,) = runs(
+        {
+            "dataset": "halfcheetah-expert-v0",
+            "more_datasets": [["halfcheetah-medium-v0"]],
+            "feature_map": "maps/halfcheetah-nl.json",
+            "reference_returns": [0.0, 1.0],
+        }
+    )
+    assert run.name == "bdt-learned-halfcheetah-medium-expert-v0-c0_1-nl-s0"
+    assert run.config.reference_returns == (0.0, 1.0)
+    assert [path.name for path in run.config.more_datasets] == ["halfcheetah-medium-v0"]
+
+
 def test_evaluations_are_those_that_fit_the_network() -> None:
     def labels(**settings: object) -> list[str]:
         return list(runs(settings)[0].evaluations)
