@@ -11,15 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.errors import (
-    BadSchema,
-    BadShape,
-    NonFinite,
-    OutOfRange,
-    ProtocolError,
-    StaleFrame,
-    TooManyBots,
-)
+from protocol.errors import BadSchema, BadShape, NonFinite, OutOfRange, ProtocolError, StaleFrame, TooManyBots
 from protocol.features import ActionComponent, ActionSpec, Feature, FeatureTable
 from protocol.recorder import Recorder
 from protocol.recording import Header, RecordingError, encode_header
