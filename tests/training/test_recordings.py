@@ -15,6 +15,7 @@ from protocol.recorder import Recorder
 from protocol.recording import Header, RecordingError
 from protocol.recording_reader import read_recording
 from tests.training import toy
+from training.datasets import open_dataset
 from training.recordings import RecordingsConfig, convert, main
 from training.traces import load_traces
 
@@ -81,8 +82,8 @@ def record_together(path: Path, episodes: list[Played], seats: int = 3, header: 
 
 
 def assert_traces(out: Path, episodes: list[Played]) -> None:
-    traces = load_traces(out)
-    assert (traces.features, traces.action) == (toy.FEATURES, toy.ACTION)
+    dataset, traces = open_dataset(out), load_traces(out)
+    assert (dataset.features, dataset.action) == (toy.FEATURES, toy.ACTION)
     assert traces.lengths_E.tolist() == [len(one.rewards) for one in episodes]
     for one, start in zip(episodes, traces.starts_E.tolist(), strict=True):
         part = slice(start, start + len(one.rewards))
