@@ -7,22 +7,16 @@ This module knows nothing about features and their costs.
 
 from __future__ import annotations
 
-import importlib.metadata
-import os
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import msgspec
 import numpy as np
 import tyro
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from minari.dataset.minari_dataset import DATASET_ID_RE
-from minari.dataset.minari_storage import MinariStorage
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
@@ -30,6 +24,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from training.column_map import LARGEST, ColumnMap
+from training.dataset_writer import DatasetWriter
 from training.episodes import Episode, cut
 from training.rows import Row, RowBatch, SourceError
 from training.source import read_rows
@@ -59,46 +54,19 @@ class Imported:
 
 def import_traces(config: ImportConfig, console: Console | None = None) -> Imported:
     """Read the log, write the dataset. Raises ValueError (SourceError for the log), OSError; then OUT is not there."""
-    _check_out(config.out)
-    columns = ColumnMap.read(config.columns)
-    batches = read_rows(config.source, columns)
-    with tempfile.TemporaryDirectory(dir=config.out.parent, prefix=".import-") as scratch:
-        episodes_file, folder = Path(scratch) / "episodes.hdf5", Path(scratch) / config.out.name
+    with DatasetWriter(config.out) as writer:
+        columns = ColumnMap.read(config.columns)
+        batches = read_rows(config.source, columns)
         with _progress(console or Console()) as progress:
-            imported = _write_episodes(episodes_file, cut(_watched(batches, progress, config), columns), columns)
+            imported = _write_episodes(writer, cut(_watched(batches, progress, config), columns), columns)
         if not imported.lengths:
             raise SourceError(f"{config.source} has no rows, expected one or more")
-        folder.mkdir()
-        storage = MinariStorage.new(
-            folder.resolve() / "data",  # Minari joins a relative path to itself
-            observation_space=_observation_space(columns),
-            action_space=_action_space(columns, imported),
-            env_spec=None if columns.environment is None else EnvSpec(columns.environment),
-            jpeg_encoding=False,
+        writer.finish(
+            (_observation_space(columns), _action_space(columns, imported)),
+            {"import": {"source": config.source.name, "columns": msgspec.to_builtins(columns)}},
+            None if columns.environment is None else EnvSpec(columns.environment),
         )
-        os.replace(episodes_file, folder / "data" / "main_data.hdf5")
-        storage.update_metadata(
-            {
-                "dataset_id": config.out.name,
-                "total_episodes": len(imported.lengths),
-                "total_steps": sum(imported.lengths),
-                "dataset_size": storage.get_size(),
-                "minari_version": importlib.metadata.version("minari"),
-                "import": {"source": config.source.name, "columns": msgspec.to_builtins(columns)},
-            }
-        )
-        os.rename(folder, config.out)
     return imported
-
-
-def _check_out(out: Path) -> None:
-    match = DATASET_ID_RE.fullmatch(out.name)
-    if match is None or match.group("version") is None:
-        raise ValueError(f"{out}: a dataset's folder has a name and a version, such as arena-expert-v0")
-    if out.exists() or out.is_symlink():
-        raise ValueError(f"{out} is there already; an import replaces nothing")
-    if not out.parent.is_dir():
-        raise ValueError(f"{out.parent} is not a folder, expected the one that {out.name} goes into")
 
 
 def _watched(batches: Iterable[RowBatch], progress: Progress, config: ImportConfig) -> Iterator[Row]:
@@ -113,31 +81,19 @@ def _progress(console: Console) -> Progress:
     return Progress(*columns, console=console)
 
 
-def _write_episodes(path: Path, episodes: Iterable[Episode], columns: ColumnMap) -> Imported:
-    """Write the groups that Minari reads, compressed, as game/recording.py does; count what passes."""
+def _write_episodes(writer: DatasetWriter, episodes: Iterable[Episode], columns: ColumnMap) -> Imported:
+    """Write every episode; count what passes."""
     names = tuple(label for column in columns.actions for label in column.labels)
     low_A = np.full(len(names), np.inf, np.float32)
     high_A, lengths, returns, terminated = -low_A, [], [], 0
-    with h5py.File(path, "w", track_order=True) as file:
-        for i, episode in enumerate(episodes):
-            _write_episode(file.create_group(f"episode_{i}"), i, episode)
-            lengths.append(len(episode.rewards))
-            returns.append(float(episode.rewards.sum(dtype=np.float64)))
-            terminated += episode.terminated
-            low_A = np.minimum(low_A, episode.actions.min(axis=0))
-            high_A = np.maximum(high_A, episode.actions.max(axis=0))
+    for episode in episodes:
+        writer.add(episode)
+        lengths.append(len(episode.rewards))
+        returns.append(float(episode.rewards.sum(dtype=np.float64)))
+        terminated += episode.terminated
+        low_A = np.minimum(low_A, episode.actions.min(axis=0))
+        high_A = np.maximum(high_A, episode.actions.max(axis=0))
     return Imported(tuple(lengths), tuple(returns), terminated, names, (low_A, high_A))
-
-
-def _write_episode(group: h5py.Group, i: int, episode: Episode) -> None:
-    n = len(episode.rewards)
-    last_T = np.arange(n) == n - 1
-    group.attrs["id"], group.attrs["total_steps"] = i, n
-    for key, values in episode.observations.items():
-        name = f"observations/{key}" if key else "observations"
-        group.create_dataset(name, data=values, chunks=values.shape, compression="lzf", shuffle=True)
-    group["actions"], group["rewards"] = episode.actions, episode.rewards
-    group["terminations"], group["truncations"] = last_T & episode.terminated, last_T & episode.truncated
 
 
 def _observation_space(columns: ColumnMap) -> spaces.Space:
