@@ -35,6 +35,7 @@ from training.config import TrainConfig
 from training.control import Control
 from training.objectives import action_loss, query_cost
 from training.policy import Known
+from training.steps import Layout
 from training.traces import Traces
 from training.train import Drawn, TrainState, draw, know, new_state
 
@@ -60,8 +61,7 @@ def _traces(steps: int, seed: int) -> Traces:
     low = torch.tensor([component.low for component in ACTION_SPEC.components])
     high = torch.tensor([component.high for component in ACTION_SPEC.components])
     return Traces(
-        table,
-        ACTION_SPEC,
+        Layout(table, ACTION_SPEC),
         torch.randn(steps, table.n_free, generator=chance),
         torch.randn(steps, table.n_costly, generator=chance).half(),
         low + (high - low) * torch.rand(steps, len(low), generator=chance),
@@ -113,7 +113,7 @@ def measure(asked: Training) -> dict[str, float]:
     state = new_state(config, traces)
     traces = traces.to(asked.device)
     torch.nn.init.normal_(state.model.acquisition_head.out.weight, std=0.5)
-    costs_M = torch.tensor(traces.features.costs_us, dtype=torch.float32, device=asked.device)
+    costs_M = torch.tensor(traces.layout.features.costs_us, dtype=torch.float32, device=asked.device)
     ways, seconds, differing = _ways(config, state, costs_M), {}, 0
     for repeat in range(asked.repeats + 1):  # the first one warms up
         drawn = draw(config, traces, np.random.default_rng([asked.seed, repeat]))

@@ -5,12 +5,16 @@ This module knows nothing about losses, sampling or files.
 
 from __future__ import annotations
 
+import torch
+
+from protocol.features import FeatureTable
 from training.config import TrainConfig
 from training.iql import Critics
 from training.mlp import BudgetedPerceptron
 from training.models import BudgetedDecisionTransformer
-from training.policy import BudgetedPolicy, ModelConfig
-from training.traces import Traces, moments
+from training.policy import BudgetedPolicy, ModelConfig, Normalisation
+from training.statistics import Spread
+from training.trace_source import TraceSource
 
 __all__ = ["build_critics", "build_model", "make_policy"]
 
@@ -22,21 +26,22 @@ def make_policy(config: ModelConfig) -> BudgetedPolicy:
     return BudgetedDecisionTransformer(config) if config.has_memory else BudgetedPerceptron(config)
 
 
-def build_model(config: TrainConfig, traces: Traces) -> BudgetedPolicy:
+def build_model(config: TrainConfig, traces: TraceSource) -> BudgetedPolicy:
     """A network for these traces, normalised by them. Raises ValueError where the action layout is another."""
-    components = traces.action.components
+    layout = traces.layout
+    components = layout.action.components
     if config.bins and len(config.bins) != len(components):
         raise ValueError(f"bins has {len(config.bins)} numbers, the action has {len(components)} components")
-    if traces.choices is not None and config.bins != (traces.choices,):
-        raise ValueError(f"bins is {config.bins}, expected ({traces.choices},): the action is one of so many choices")
+    if layout.choices is not None and config.bins != (layout.choices,):
+        raise ValueError(f"bins is {config.bins}, expected ({layout.choices},): the action is one of so many choices")
     names = [component.name for component in components]
     if unknown := set(config.sampled) - set(names):
         raise ValueError(f"sampled names {sorted(unknown)}, the action has {names}")
     model = make_policy(
         ModelConfig(
-            octaves=_octaves(config, traces),
-            owner=tuple(int(i) for i in traces.features.owner),
-            n_queries=traces.features.n_queries,
+            octaves=_octaves(config, layout.features),
+            owner=tuple(int(i) for i in layout.features.owner),
+            n_queries=layout.features.n_queries,
             bins=config.bins,
             low=tuple(component.low for component in components),
             high=tuple(component.high for component in components),
@@ -53,15 +58,20 @@ def build_model(config: TrainConfig, traces: Traces) -> BudgetedPolicy:
             cost_range=(config.budgets[0], config.budgets[-1]) if config.budgets else None,
         )
     )
-    model.normalise_free.fit(*moments(traces.free_SF))
-    model.normalise_costly.fit(*moments(traces.costly_SD))
-    model.normalise_return.fit(*moments(traces.returns_to_go_S[:, None]))
+    statistics = traces.statistics
+    _fit(model.normalise_free, statistics.free)
+    _fit(model.normalise_costly, statistics.costly)
+    _fit(model.normalise_return, statistics.returns_to_go)
     return model
 
 
-def _octaves(config: TrainConfig, traces: Traces) -> tuple[int, ...]:
+def _fit(normalisation: Normalisation, spread: Spread) -> None:
+    normalisation.fit(torch.tensor(spread.mean), torch.tensor(spread.scale))
+
+
+def _octaves(config: TrainConfig, features: FeatureTable) -> tuple[int, ...]:
     """Of each free number. Raises ValueError for a feature that is not there or not free."""
-    free = traces.features.free
+    free = features.free
     if unknown := set(config.octaves) - {feature.name for feature in free}:
         raise ValueError(f"octaves names {sorted(unknown)}, the free features are {[feature.name for feature in free]}")
     return tuple(config.octaves.get(feature.name, config.fourier) for feature in free for _ in range(feature.size))

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
 import torch
 
 from protocol.features import ActionSpec, FeatureTable
@@ -19,15 +18,12 @@ from training.build import make_policy
 from training.config import TrainConfig
 from training.feature_map import FeatureMap
 from training.policy import BudgetedPolicy, ModelConfig
-from training.traces import Traces
+from training.trace_source import TraceSource
 
 if TYPE_CHECKING:
     from training.train import TrainState
 
 __all__ = ["Facts", "Trained", "load_checkpoint", "load_trained", "save_checkpoint"]
-
-_GOLDEN_CANDIDATES = 8  # episodes looked at when one is chosen for golden.npz
-_GOLDEN_TURNS = 128
 
 
 @dataclass(frozen=True)
@@ -41,21 +37,19 @@ class Facts:
     feature_map: FeatureMap | None = None  # None: the environment itself tells free from costly
 
     @classmethod
-    def of(cls, traces: Traces, target_return: float | None, feature_map: FeatureMap | None = None) -> Facts:
+    def of(cls, traces: TraceSource, target_return: float | None) -> Facts:
         """The facts of these traces; `target_return` None takes the 90th percentile of their returns."""
-        episode = int(traces.lengths_E[:_GOLDEN_CANDIDATES].argmax())
-        start = int(traces.starts_E[episode])
-        turns = slice(start, start + min(int(traces.lengths_E[episode]), _GOLDEN_TURNS))
-        togo = traces.returns_to_go_S[turns]
+        layout, example = traces.layout, traces.example
+        togo = example.returns_to_go_T
         golden = {
-            "free": traces.free_SF[turns].clone(),
-            "costly": traces.costly_SD[turns].float(),
+            "free": example.free_TF.clone(),
+            "costly": example.costly_TD.float(),
             # A turn's reward is the one since the turn before it.
             "rewards": torch.cat([torch.zeros(1), togo[:-1] - togo[1:]]),
         }
         if target_return is None:
-            target_return = float(np.percentile(traces.episode_returns_E, 90))
-        return cls(traces.features, traces.action, target_return, golden, feature_map)
+            target_return = traces.statistics.return_90
+        return cls(layout.features, layout.action, target_return, golden, layout.feature_map)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from training.checkpoint import Facts, save_checkpoint
 from training.config import TrainConfig
-from training.traces import Traces
+from training.statistics import Statistics
 
 if TYPE_CHECKING:
     from training.train import TrainState
@@ -80,13 +80,16 @@ class RunRecord:
         self._progress.update(self._task, now=now)
 
 
-def write_versions(path: Path, traces: Traces) -> None:
+def write_versions(path: Path, statistics: Statistics, workers: int) -> None:
     """What made a run: versions of the libraries, threads, and how much was read."""
-    versions = {name: importlib.metadata.version(name) for name in ("torch", "onnx", "onnxruntime", "numpy", "minari")}
+    libraries = ("torch", "onnx", "onnxruntime", "numpy", "minari", "pyarrow")
+    versions = {name: importlib.metadata.version(name) for name in libraries}
     versions |= {
         "python": platform.python_version(),
         "machine": platform.machine(),
         "threads": str(torch.get_num_threads()),
+        "workers": str(workers),
+        "episodes": str(statistics.n_episodes),
+        "steps": str(statistics.n_steps),
     }
-    versions |= {"episodes": str(len(traces.lengths_E)), "steps": str(int(traces.lengths_E.sum()))}
     path.write_text(json.dumps(versions, indent=2) + "\n")

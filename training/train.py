@@ -24,12 +24,12 @@ from training.build import build_critics, build_model
 from training.checkpoint import Facts, load_checkpoint
 from training.config import TrainConfig
 from training.control import Control, draw_costs
-from training.feature_map import FeatureMap
 from training.iql import Critics
 from training.objectives import action_loss, query_cost
 from training.policy import BudgetedPolicy, Known
 from training.record import RunRecord, write_versions
-from training.traces import Batch, Traces, draw_windows, load_traces
+from training.trace_source import TraceSource, open_traces
+from training.traces import Batch, Traces, draw_windows
 
 __all__ = ["Drawn", "TrainState", "draw", "know", "main", "new_state", "train", "update"]
 
@@ -60,7 +60,7 @@ class Drawn:
     uniforms_BTM: Tensor
 
 
-def new_state(config: TrainConfig, traces: Traces) -> TrainState:
+def new_state(config: TrainConfig, traces: TraceSource) -> TrainState:
     """A run before its first update. Raises ValueError where settings and traces do not fit."""
     torch.manual_seed(config.seed)
     model = build_model(config, traces)
@@ -83,7 +83,7 @@ def learning_rate(config: TrainConfig, done: int) -> float:
 def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator) -> Drawn:
     """Windows, their target costs and the noise of their queries."""
     batch = draw_windows(traces, config.batch, config.window, chance)
-    shape = (*batch.valid_BT.shape, traces.features.n_queries)
+    shape = (*batch.valid_BT.shape, traces.layout.features.n_queries)
     uniforms = torch.from_numpy(chance.random(shape, dtype=np.float32)).to(config.device)
     # Past an episode's end nothing is asked for, so that padding takes nothing of a budget that windows share.
     uniforms = torch.where(batch.valid_BT[..., None] > 0.0, uniforms, 1.0)
@@ -205,26 +205,24 @@ def _weights(control: Control) -> dict[str, float]:
 def train(config: TrainConfig) -> TrainState:
     """Train to the end, from the run's checkpoint if there is one; returns the final state."""
     config.out.mkdir(parents=True, exist_ok=True)
-    feature_map = None if config.feature_map is None else FeatureMap.read(config.feature_map)
-    paths = (config.dataset, *config.more_datasets)
-    traces = load_traces(*paths, episodes=config.episodes, feature_map=feature_map)
+    traces = open_traces(config)
     state = new_state(config, traces)
-    facts = Facts.of(traces, config.target_return, feature_map)
+    facts = Facts.of(traces, config.target_return)
     if (config.out / "checkpoint.pt").exists():
         load_checkpoint(config.out / "checkpoint.pt", config, state)
     config.write(config.out / "config.json")
-    write_versions(config.out / "versions.json", traces)
-    costs_M = torch.tensor(traces.features.costs_us, dtype=torch.float32, device=config.device)
+    write_versions(config.out / "versions.json", traces.statistics, 1)
+    costs_M = torch.tensor(traces.layout.features.costs_us, dtype=torch.float32, device=config.device)
     training, held_out = traces.to(config.device).split(config.held_out)
 
     def measure() -> dict[str, float]:
-        if not len(held_out.lengths_E):
+        if not len(held_out):
             return {}
-        return {"held_out": held_out_loss(config, state.model, held_out, costs_M)}
+        return {"held_out": held_out_loss(config, state.model, held_out.pool(0), costs_M)}
 
     with RunRecord(config, state, facts, measure) as run:
         while state.done < config.updates:
-            update(config, state, training, costs_M)
+            update(config, state, training.pool(state.done), costs_M)
             run.record()
     return state
 

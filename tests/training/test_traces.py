@@ -14,7 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.training import toy
-from training.traces import TracesError, draw_windows, load_traces, moments, returns_to_go
+from training.datasets import TracesError
+from training.steps import returns_to_go
+from training.traces import draw_windows, load_traces
 
 
 @given(st.lists(st.floats(-100, 100), min_size=1, max_size=30))
@@ -25,9 +27,9 @@ def test_returns_to_go_is_the_sum_of_what_is_left(rewards: list[float]) -> None:
 
 def test_reads_what_was_recorded(dataset: Path) -> None:
     traces = load_traces(dataset)
-    assert traces.features == toy.FEATURES
+    assert traces.layout.features == toy.FEATURES
     assert len(traces.lengths_E) == 40
-    assert traces.free_SF.shape == (traces.lengths_E.sum(), traces.features.n_free)
+    assert traces.free_SF.shape == (traces.lengths_E.sum(), traces.layout.features.n_free)
     # The toy's clock counts the timesteps of each episode from 0.
     clocks = [torch.arange(int(n)).float() for n in traces.lengths_E]
     assert torch.equal(traces.free_SF[:, 1], torch.cat(clocks))
@@ -56,24 +58,6 @@ def test_held_out_episodes_are_never_drawn(dataset: Path) -> None:
     seen = torch.cat([draw_windows(kept, 64, 12, generator).costly_BTD.flatten(0, 1) for _ in range(20)])
     drawn = {tuple(row) for row in seen.tolist()}
     assert drawn <= {tuple(row) for row in kept.costly_SD[:boundary].float().tolist()}
-
-
-def test_moments_are_the_mean_and_a_floored_deviation() -> None:
-    x = torch.zeros(1000, 2)
-    x[:, 0] = torch.linspace(-1, 1, 1000)
-    x[0, 1] = 1.0  # a class seen once
-    mean, scale = moments(x)
-    assert mean.tolist() == pytest.approx([0.0, 0.001], abs=1e-6)
-    assert scale[0].item() == pytest.approx(x[:, 0].std(correction=0).item(), rel=1e-4)
-    assert scale[1].item() == pytest.approx(0.0999, rel=1e-3)
-
-
-def test_moments_of_constants_can_be_divided_by() -> None:
-    """Numbers that never change in the traces; more rows than are summed at once."""
-    mean, scale = moments(torch.tensor([[0.0, 3.0]]).expand(70_000, 2))
-    assert mean.tolist() == [0.0, 3.0]
-    assert (scale > 0).all()
-    assert torch.isfinite((torch.ones(2) - mean) / scale).all()
 
 
 def test_refuses_links_out_of_the_file(dataset: Path, tmp_path: Path) -> None:

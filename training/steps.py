@@ -1,0 +1,122 @@
+"""Timesteps of recorded episodes as they are trained on: checked numbers, returns-to-go, an episode at a time.
+
+This module knows nothing about batches or networks. Shape letters: T timesteps, and those of `protocol.features`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from protocol.features import ActionSpec, FeatureTable
+from training.datasets import Dataset, TracesError, open_dataset
+from training.feature_map import FeatureMap
+
+__all__ = ["Layout", "Recordings", "Steps", "costly_type", "returns_to_go"]
+
+_HALF_FROM = 256  # costly numbers: from here on half the memory matters, and rays carry no more precision than that
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the numbers of a timestep are."""
+
+    features: FeatureTable
+    action: ActionSpec
+    choices: int | None = None  # of a discrete action; None: the action is numbers
+    feature_map: FeatureMap | None = None  # None: the dataset itself tells free from costly
+
+
+class Steps(NamedTuple):
+    """T timesteps: an episode, or several one after another."""
+
+    free_TF: Tensor  # float32, raw units
+    costly_TD: Tensor  # float32, raw units; float16 where they are many
+    actions_TA: Tensor  # float32
+    returns_to_go_T: Tensor  # float32
+
+    @classmethod
+    def joined(cls, parts: Sequence[Steps]) -> Steps:
+        """One after another."""
+        return cls(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+
+    def part(self, steps: slice) -> Steps:
+        """Some of the timesteps."""
+        return Steps(*(tensor[steps] for tensor in self))
+
+
+def costly_type(features: FeatureTable) -> type[np.floating]:
+    """How costly numbers are kept."""
+    return np.float16 if features.n_costly >= _HALF_FROM else np.float32
+
+
+def returns_to_go(rewards_T: NDArray[np.floating]) -> NDArray[np.float32]:
+    """R_t = r_t + r_{t+1} + ... + r_{T-1}, shape [T]."""
+    return rewards_T[::-1].cumsum(dtype=np.float64)[::-1].astype(np.float32)
+
+
+class Recordings:
+    """The episodes of Minari datasets (training/datasets.py), an episode of each in turn. Iterating reads them."""
+
+    def __init__(
+        self, paths: Sequence[Path], episodes: int | None = None, feature_map: FeatureMap | None = None
+    ) -> None:
+        """`episodes` of each dataset, None: all. Raises TracesError when one is no such dataset or differs from the
+        others."""
+        self._datasets = [open_dataset(path, feature_map) for path in paths]
+        first = self._datasets[0]
+        for dataset in self._datasets[1:]:
+            if (dataset.features, dataset.action) != (first.features, first.action):
+                raise TracesError(f"{dataset.path} and {first.path} have other features or other actions")
+        counts = [_count(dataset, episodes) for dataset in self._datasets]
+        self._wanted = sorted((i, which) for which, count in enumerate(counts) for i in range(count))
+        self.layout = Layout(first.features, first.action, first.choices, feature_map)
+        self.names = ", ".join(dataset.path.name for dataset in self._datasets)
+
+    def __len__(self) -> int:
+        """How many episodes there are."""
+        return len(self._wanted)
+
+    def __iter__(self) -> Iterator[Steps]:
+        """Raises TracesError for an episode that does not match the feature table."""
+        for i, which in self._wanted:
+            yield _read(self._datasets[which], i)
+
+
+def _count(dataset: Dataset, episodes: int | None) -> int:
+    count = len(dataset) if episodes is None else min(len(dataset), episodes)
+    if count < 1:
+        raise TracesError(f"{dataset.path}: {count} of {len(dataset)} episodes to read, expected 1 or more")
+    return count
+
+
+def _read(dataset: Dataset, i: int) -> Steps:
+    read, where = dataset.episode(i), f"{dataset.path}: episode {i}"
+    n, features = len(read.rewards_T), dataset.features
+    if not n:
+        raise TracesError(f"{where} has no timesteps, expected 1 or more")
+    rewards = _rows(where, "rewards", read.rewards_T, (n,), np.float64)
+    return Steps(
+        _rows(where, "free", read.free_TF, (n, features.n_free), np.float32),
+        _rows(where, "costly", read.costly_TD, (n, features.n_costly), costly_type(features)),
+        _rows(where, "actions", read.actions_TA, (n, dataset.action.size), np.float32),
+        torch.from_numpy(returns_to_go(rewards.numpy())),
+    )
+
+
+def _rows(where: str, name: str, array: NDArray[np.floating], shape: tuple[int, ...], dtype: type) -> Tensor:
+    """The array as it is kept; numbers that do not fit `dtype` are refused like any that are not finite."""
+    if array.shape != shape:
+        raise TracesError(f"{where}: {name} has shape {array.shape}, expected {shape}")
+    with np.errstate(over="ignore"):
+        kept = array.astype(dtype)
+    if not np.isfinite(kept).all():
+        raise TracesError(f"{where}: {name} has numbers that are not finite as {np.dtype(dtype)}")
+    return torch.from_numpy(kept)
