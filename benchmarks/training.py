@@ -33,11 +33,12 @@ from training.acquisition import (
 )
 from training.config import TrainConfig
 from training.control import Control
+from training.draws import Drawn, draw
 from training.objectives import action_loss, query_cost
 from training.policy import Known
 from training.steps import Layout
 from training.traces import Traces
-from training.train import Drawn, TrainState, draw, know, new_state
+from training.train import TrainState, know, new_state
 
 __all__ = ["Training", "main", "measure"]
 
@@ -93,7 +94,7 @@ def _ways(config: TrainConfig, state: TrainState, costs_M: torch.Tensor) -> dict
             known = know(model, drawn)
             query, _ = sampler(model, known, drawn.uniforms_BTM)
             sampled = rollout(model, known, query.requires_grad_())
-            backward(sampled, lambda each: loss(each, drawn), config.sweeps, list(model.parameters()))
+            backward(sampled, loss(sampled, drawn), config.sweeps, list(model.parameters()))
             return query.detach()
 
         return run

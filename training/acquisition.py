@@ -138,23 +138,19 @@ def sample_queries_sequentially(
     return Rollout(torch.stack(queries, 1), torch.stack(probs_all, 1), torch.stack(hiddens, 1))
 
 
-def backward(
-    sampled: Rollout, loss: Callable[[Rollout], Tensor], sweeps: int, parameters: Sequence[nn.Parameter]
-) -> Tensor:
-    """Accumulate gradients of `parameters` of `loss` with straight-through queries; return the loss, detached.
+def backward(sampled: Rollout, loss: Tensor, sweeps: int, parameters: Sequence[nn.Parameter]) -> None:
+    """Accumulate gradients of `parameters` of a scalar `loss` of `sampled` with straight-through queries.
 
     `sampled.query_BTM` must be a leaf that requires a gradient. Each sweep but the last only moves the adjoint of the
     queries one query further into the past; the last one reaches the parameters, and leaves the queries out.
     """
-    value = loss(sampled)
     query, probs = sampled.query_BTM, sampled.probs_BTM
     if not probs.requires_grad:
-        value.backward(inputs=parameters)
-        return value.detach()
-    (direct,) = torch.autograd.grad(value, query, retain_graph=True)
+        loss.backward(inputs=parameters)
+        return
+    (direct,) = torch.autograd.grad(loss, query, retain_graph=True)
     adjoint = direct
     for _ in range(sweeps - 1):
         (through,) = torch.autograd.grad(probs, query, grad_outputs=adjoint, retain_graph=True)
         adjoint = direct + through
-    torch.autograd.backward([value, probs], [torch.ones_like(value), adjoint], inputs=parameters)
-    return value.detach()
+    torch.autograd.backward([loss, probs], [torch.ones_like(loss), adjoint], inputs=parameters)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from training.objectives import penalty
 
-__all__ = ["Control", "draw_costs"]
+__all__ = ["Control", "Spent", "draw_costs"]
 
 _FIRST_WEIGHT = 0.05  # of the dual control: features are nearly free at first, so that their worth is seen
 _LEAST_WEIGHT, _MOST_WEIGHT = -0.1, 1e3
@@ -43,6 +44,26 @@ def draw_costs(
     strata = (chance.integers(len(edges) - 1) + np.arange(groups)) % (len(edges) - 1)
     low, high = np.log(np.asarray(edges))[strata], np.log(np.asarray(edges))[strata + 1]
     return np.exp(chance.uniform(low, high)).astype(np.float32), strata
+
+
+class Spent(NamedTuple):
+    """What a batch asked for, and what it was allowed."""
+
+    cost_BT: Tensor
+    target_B: Tensor
+    stratum_B: Tensor
+    valid_BT: Tensor
+
+    def means(self, strata: int) -> dict[str, float]:
+        """Mean cost asked for; of each of so many strata as a share of its C as well."""
+        counted_BT, valid_BT = self.cost_BT * self.valid_BT, self.valid_BT
+        means = {"cost": (counted_BT.sum() / valid_BT.sum()).item()}
+        for i in range(strata):
+            rows = self.stratum_B == i
+            if rows.any():
+                allowed = (self.target_B[rows, None] * valid_BT[rows]).sum()
+                means[f"spent_{i}"] = (counted_BT[rows].sum() / allowed).item()
+        return means
 
 
 @dataclass
@@ -65,6 +86,13 @@ class Control:
         if self.kind == "algorithm-1":
             return penalty(cost_BT, target_B[:, None], valid_BT, weight_BT), phi
         return (weight_BT * (cost_BT - target_B[:, None])).sum() / valid_BT.sum(), phi
+
+    def means(self) -> dict[str, float]:
+        """γ, and that of each stratum where there are several."""
+        means = {"gamma": sum(self.weights) / len(self.weights)}
+        if len(self.weights) > 1:
+            means |= {f"gamma_{i}": weight for i, weight in enumerate(self.weights)}
+        return means
 
     def observe(self, cost_BT: Tensor, target_B: Tensor, stratum_B: Tensor, valid_BT: Tensor) -> None:
         """Move each γ after a batch that spent `cost_BT`."""

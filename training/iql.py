@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["Critics"]
+__all__ = ["Critics", "taught"]
 
 _WIDTH = 256
 _EXPECTILE = 0.7  # τ of the locomotion tasks
@@ -21,6 +21,14 @@ _TEMPERATURE = 3.0  # β of the locomotion tasks, on rewards scaled as below
 _DISCOUNT = 0.99
 _POLYAK = 0.05  # how fast the target Q follows: ten times the authors', for runs of thousands of updates, not a million
 _MOST_WEIGHT = 100.0
+
+
+def taught(last_BT: Tensor, valid_BT: Tensor) -> Tensor:
+    """Timesteps that teach Q something: a window's last one has no successor in it, and counts for V alone, unless its
+    episode ends there. [B, T]"""
+    taught_BT = valid_BT.clone()
+    taught_BT[:, -1] *= last_BT[:, -1]
+    return taught_BT
 
 
 def _perceptron(inputs: int) -> nn.Sequential:
@@ -46,13 +54,14 @@ class Critics(nn.Module):
             advantage = self._target(state_BTX, action_BTA) - self.value(state_BTX)[..., 0]
             return torch.exp(_TEMPERATURE * advantage).clamp(max=_MOST_WEIGHT)
 
-    def loss(
+    def forward(
         self, state_BTX: Tensor, action_BTA: Tensor, returns_to_go_BT: Tensor, last_BT: Tensor, valid_BT: Tensor
-    ) -> Tensor:
-        """Expectile loss of V (Eq. 5 there) and squared TD error of both Q (Eq. 6 there). Scalar.
+    ) -> tuple[Tensor, Tensor]:
+        """Expectile loss of V (Eq. 5 there), a mean over `valid`; squared TD error of both Q (Eq. 6 there), a mean over
+        `taught`. Scalars, to be minimised together.
 
         The reward of a timestep is what its return-to-go loses until the next one; an episode's last timestep keeps it
-        all. A window's last timestep has no successor in it and counts for V alone.
+        all.
         """
         value_BT = self.value(state_BTX)[..., 0]
         gap = self._target(state_BTX, action_BTA) - value_BT
@@ -61,11 +70,10 @@ class Critics(nn.Module):
         next_togo = functional.pad(returns_to_go_BT[:, 1:], (0, 1)) * (1.0 - last_BT)
         next_value = functional.pad(value_BT[:, 1:], (0, 1)) * (1.0 - last_BT)
         goal = (returns_to_go_BT - next_togo) / self.reward_scale + _DISCOUNT * next_value.detach()
-        known_BT = valid_BT.clone()
-        known_BT[:, -1] *= last_BT[:, -1]
+        taught_BT = taught(last_BT, valid_BT)
         both = torch.cat([state_BTX, action_BTA], dim=-1)
-        errors = [((q(both)[..., 0] - goal).square() * known_BT).sum() / known_BT.sum().clamp(min=1.0) for q in self.q]
-        return value_loss + errors[0] + errors[1]
+        errors_BT = sum((q(both)[..., 0] - goal).square() for q in self.q)
+        return value_loss, (errors_BT * taught_BT).sum() / taught_BT.sum().clamp(min=1.0)
 
     @torch.no_grad()
     def follow(self) -> None:

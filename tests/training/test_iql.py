@@ -23,7 +23,7 @@ def fitted(critics: Critics, episodes: tuple[torch.Tensor, ...], updates: int) -
     optimiser = torch.optim.Adam([p for p in critics.parameters() if p.requires_grad], lr=3e-3)
     for _ in range(updates):
         optimiser.zero_grad()
-        critics.loss(*episodes).backward()
+        sum(critics(*episodes)).backward()
         optimiser.step()
         critics.follow()
     return critics
@@ -56,12 +56,12 @@ def test_a_windows_last_timestep_without_successor_teaches_q_nothing() -> None:
 
     def q_gradient(returns: torch.Tensor) -> torch.Tensor:
         critics.zero_grad()
-        critics.loss(state, action, returns, cut, valid).backward()
+        sum(critics(state, action, returns, cut, valid)).backward()
         return critics.q[0][0].weight.grad[:, 3].clone()  # what the last timestep's one-hot moves
 
     assert (q_gradient(togo) == 0).all()
     critics.zero_grad()
-    critics.loss(state, action, togo, last, valid).backward()
+    sum(critics(state, action, togo, last, valid)).backward()
     assert (critics.q[0][0].weight.grad[:, 3] != 0).any()
 
 
@@ -76,5 +76,5 @@ def test_padding_and_rewards_after_the_end_do_not_count() -> None:
     other_state, other_togo = state.clone(), togo.clone()
     other_state[:, 2:] += 9.0
     other_togo[:, 2:] += 9.0
-    first = critics.loss(state, action, togo, ends, padded)
-    assert torch.allclose(first, critics.loss(other_state, action, other_togo, ends, padded))
+    first = sum(critics(state, action, togo, ends, padded))
+    assert torch.allclose(first, sum(critics(other_state, action, other_togo, ends, padded)))

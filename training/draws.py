@@ -1,0 +1,55 @@
+"""What chance gives an update: windows, the target cost of each, and the noise of its queries.
+
+This module knows nothing about networks. Shape letters as in `training.traces`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from training import workers
+from training.config import TrainConfig
+from training.control import draw_costs
+from training.traces import EVERY_WINDOW, Batch, Traces, draw_windows
+
+__all__ = ["Drawn", "draw", "draw_share"]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A batch, and what chance gave it."""
+
+    batch: Batch
+    target_B: Tensor  # C of each window
+    stratum_B: Tensor  # and which γ it has
+    uniforms_BTM: Tensor
+
+
+def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator, rows: slice = EVERY_WINDOW) -> Drawn:
+    """Windows, their target costs and the noise of their queries; of a whole batch `rows` are read."""
+    batch = draw_windows(traces, config.batch, config.window, chance, rows)
+    shape = (config.batch, config.window, traces.layout.features.n_queries)
+    uniforms = torch.from_numpy(chance.random(shape, dtype=np.float32)[rows]).to(config.device)
+    # Past an episode's end nothing is asked for, so that padding takes nothing of a budget that windows share.
+    uniforms = torch.where(batch.valid_BT[..., None] > 0.0, uniforms, 1.0)
+    together = _together(config)
+    targets, strata = np.full(config.batch, config.budget, np.float32), np.zeros(config.batch, np.int64)
+    if config.budgets:
+        drawn = draw_costs(config.budgets, config.batch // together, chance)
+        targets, strata = (part.repeat(together) for part in drawn)
+    targets, strata = (torch.from_numpy(part[rows]).to(config.device) for part in (targets, strata))
+    return Drawn(batch, targets, strata, uniforms)
+
+
+def draw_share(config: TrainConfig, traces: Traces, chance: np.random.Generator) -> Drawn:
+    """This worker's part of a batch. Raises ValueError where the batch cannot be shared out."""
+    return draw(config, traces, chance, workers.share(config.batch, _together(config)))
+
+
+def _together(config: TrainConfig) -> int:
+    """Windows that share a budget, and so belong to one worker."""
+    return config.frame_bots if config.allocation == "frame" else 1
