@@ -53,6 +53,7 @@ class TrainConfig:
 
     context_length: int = 20  # K
     window: int = 60  # timesteps in a training window
+    beginnings: float = 0.0  # share of the windows that start where their episode does: rare states, met in each one
     width: int = 64  # W
     n_layers: int = 2  # L; hidden layers of width W where there is no memory
     n_heads: int = 4  # H
@@ -72,7 +73,7 @@ class TrainConfig:
     checkpoint_every: int = 500  # updates between checkpoints
 
     def __post_init__(self) -> None:
-        for name in ("budget", "frame_budget", "held_out"):
+        for name in ("budget", "frame_budget", "held_out", "beginnings"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
         for name in _COUNTS:

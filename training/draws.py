@@ -31,7 +31,7 @@ class Drawn:
 
 def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator, rows: slice = EVERY_WINDOW) -> Drawn:
     """Windows, their target costs and the noise of their queries; of a whole batch `rows` are read."""
-    batch = draw_windows(traces, config.batch, config.window, chance, rows)
+    batch = draw_windows(traces, config.batch, config.window, chance, rows, config.beginnings)
     shape = (config.batch, config.window, traces.layout.features.n_queries)
     uniforms = torch.from_numpy(chance.random(shape, dtype=np.float32)[rows]).to(config.device)
     # Past an episode's end nothing is asked for, so that padding takes nothing of a budget that windows share.

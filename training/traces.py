@@ -117,15 +117,23 @@ def load_traces(*paths: Path, episodes: int | None = None, feature_map: FeatureM
 
 
 def draw_windows(
-    traces: Traces, batch: int, length: int, generator: np.random.Generator, rows: slice = EVERY_WINDOW
+    traces: Traces,
+    batch: int,
+    length: int,
+    generator: np.random.Generator,
+    rows: slice = EVERY_WINDOW,
+    beginnings: float = 0.0,
 ) -> Batch:
     """Windows [B, T] of a batch: an episode in proportion to its length, then a start that lets its first timesteps be
-    seen as often as the others. The batch is drawn whole; `rows` of it are read."""
+    seen as often as the others, but for the share `beginnings` of the windows, which start where their episode does.
+    The batch is drawn whole; `rows` of it are read."""
     share = traces.lengths_E / traces.lengths_E.sum()
     episode_B = generator.choice(len(share), size=batch, p=share)
     length_B = traces.lengths_E[episode_B]
     start_B = generator.integers(-(length // 2), np.maximum(length_B - length // 2, 1))
     start_B = start_B.clip(0, np.maximum(length_B - length, 0))
+    if beginnings:
+        start_B[generator.random(batch) < beginnings] = 0
     episode_B, length_B, start_B = episode_B[rows], length_B[rows], start_B[rows]
     step_BT = start_B[:, None] + np.arange(length)
     valid_BT = step_BT < length_B[:, None]

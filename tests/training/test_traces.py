@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -142,3 +143,17 @@ def test_refuses_metadata_that_lack_a_key(dataset: Path, tmp_path: Path, key: st
 def test_refuses_to_read_nothing(dataset: Path, episodes: int) -> None:
     with pytest.raises(TracesError, match="expected 1 or more"):
         load_traces(dataset, episodes=episodes)
+
+
+def test_a_share_of_the_windows_begins_with_the_episode(dataset: Path) -> None:
+    traces = load_traces(dataset)
+    first_S1 = torch.zeros(len(traces.free_SF), 1)
+    first_S1[torch.from_numpy(traces.starts_E)] = 1.0
+    marked = replace(traces, free_SF=first_S1)
+    shares = []
+    for beginnings in (0.0, 0.5, 1.0):
+        batch = draw_windows(marked, 2000, 3, np.random.default_rng(0), beginnings=beginnings)
+        shares.append(batch.free_BTF[:, 0, 0].mean().item())
+    assert shares[0] < 0.2
+    assert shares[1] == pytest.approx(0.5 * (1.0 + shares[0]), abs=0.03)
+    assert shares[2] == 1.0
