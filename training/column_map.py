@@ -4,8 +4,9 @@
      "action": [{"column": "turn", "low": -1, "high": 1}, "forward"], "reward": "score", "terminated": "died"}
 
 `observations` in place of `observation` names parts: {"body": ["health"], "rays": [{"column": "rays", "size": 96}]}.
-A column with a `size` holds a list of so many numbers in every row. This module knows nothing about rows and files of
-rows. Shape letters: A action numbers, X numbers of a timestep.
+A column with a `size` holds a list of so many numbers in every row. An action that is one of a few choices is
+`"action": [{"column": "key", "choices": 3}]`. This module knows nothing about rows and files of rows. Shape letters:
+A action numbers, X numbers of a timestep.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ __all__ = ["LARGEST", "MAX_COLUMNS", "MAX_NAME", "MAX_NUMBERS", "ActionColumn", 
 
 MAX_COLUMNS = 16_384  # of a source, and of a map: a column a number, where a timestep has the most numbers
 MAX_NAME = 256  # characters, of a column or of an episode: names of all episodes are kept, to notice one that returns
+MAX_CHOICES = 16_384  # of an action; training needs an output of the network for each
 MAX_NUMBERS = 16_384  # of a timestep: the shipped games have 600, and a row of text must fit a line
 LARGEST = float(np.finfo(np.float32).max)  # what is recorded is float32
 _MAX_MAP_BYTES = 2**22  # MAX_COLUMNS names of MAX_NAME characters
@@ -54,10 +56,12 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 class ActionColumn(Column, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A column of the action. `low` and `high` are the range of its numbers; None takes what the log has."""
+    """A column of the action. `low` and `high` are the range of its numbers; None takes what the log has. With
+    `choices`, it holds which of so many was taken: a whole number from 0."""
 
     low: float | None = None
     high: float | None = None
+    choices: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,6 +70,19 @@ class ActionColumn(Column, frozen=True, forbid_unknown_fields=True, omit_default
                 raise ValueError(f"action {self.column!r} has {name} {bound}, expected a finite float32")
         if self.low is not None and self.high is not None and not self.low < self.high:
             raise ValueError(f"action {self.column!r} has range [{self.low}, {self.high}], expected increasing")
+        if self.choices is None:
+            return
+        if not 2 <= self.choices <= MAX_CHOICES:
+            raise ValueError(f"action {self.column!r} has {self.choices} choices, expected 2 to {MAX_CHOICES}")
+        if (self.size, self.low, self.high) != (None, None, None):
+            raise ValueError(f"action {self.column!r} has choices, expected neither size nor low nor high beside them")
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Lowest and highest number that a row may hold; float32's own where none is declared."""
+        if self.choices is not None:
+            return 0.0, self.choices - 1.0
+        return -LARGEST if self.low is None else self.low, LARGEST if self.high is None else self.high
 
 
 class ColumnMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, dict=True):
@@ -93,6 +110,8 @@ class ColumnMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
         for key, part in self.observed.items():
             _check_list(f"observations.{key}" if key else "observation", part)
         _check_list("action", self.actions)
+        if len(self.actions) > 1 and any(column.choices is not None for column in self.actions):
+            raise ValueError("action has choices in one of several columns, expected an action of one column")
         _check_sizes(self.numbers)
         if len(self.names) > MAX_COLUMNS or len(self.labels) > MAX_NUMBERS:
             raise ValueError(
@@ -142,11 +161,15 @@ class ColumnMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
         return tuple(dict.fromkeys(name for name in (*single, *(c.column for c in self.numbers)) if name is not None))
 
     @cached_property
+    def choices(self) -> int | None:
+        """How many the action is one of; None where it is numbers."""
+        return self.actions[0].choices
+
+    @cached_property
     def action_range(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Declared lowest and highest value of each action number, each shape [A]; float32's own where none is."""
-        low = [-LARGEST if column.low is None else column.low for column in self.actions for _ in range(column.width)]
-        high = [LARGEST if column.high is None else column.high for column in self.actions for _ in range(column.width)]
-        return np.array(low), np.array(high)
+        """Lowest and highest value of each action number, each shape [A]; float32's own where none is declared."""
+        ranges = np.array([column.bounds for column in self.actions for _ in range(column.width)])
+        return ranges[:, 0], ranges[:, 1]
 
 
 def _columns(part: tuple[str | Column, ...], kind: type) -> tuple[Column, ...]:

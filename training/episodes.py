@@ -30,7 +30,7 @@ class Episode:
     """One episode as it is recorded."""
 
     observations: dict[str, NDArray[np.float32]]  # [T+1, n] of each part ("" where flat); the last row stands twice
-    actions: NDArray[np.float32]  # [T, A]
+    actions: NDArray[np.float32] | NDArray[np.int64]  # [T, A]; whole [T] where the action is a choice
     rewards: NDArray[np.float32]  # [T]
     terminated: bool  # at its last timestep
     truncated: bool
@@ -128,16 +128,24 @@ class _Form:
             raise self._wrong_number(values) from None
         if not ((row_X >= self._low_X) & (row_X <= self._high_X)).all():
             raise self._wrong_number(values)
+        if self._columns.choices is not None and not row_X[-2].is_integer():
+            raise self._wrong_choice(values[-2])
         return row_X.astype(np.float32)
 
     def _wrong_number(self, values: list) -> ValueError:
         lows, highs = self._low_X.tolist(), self._high_X.tolist()
         ranges = zip(values, lows, highs, strict=True)
         i = next(i for i, (x, low, high) in enumerate(ranges) if type(x) not in _KINDS or not low <= x <= high)
+        if self._columns.choices is not None and i == len(values) - 2:
+            return self._wrong_choice(values[i])
         expected = "a finite number that float32 holds"
         if (lows[i], highs[i]) != (-LARGEST, LARGEST):
             expected = f"a number from {lows[i]:g} to {highs[i]:g}, as the column map says"
         return _wrong(self._columns.labels[i], values[i], expected)
+
+    def _wrong_choice(self, value: object) -> ValueError:
+        expected = f"a whole number from 0 to {self._columns.choices - 1}, as the column map says"
+        return _wrong(self._columns.labels[-2], value, expected)
 
 
 class _Growing:
@@ -175,8 +183,10 @@ class _Growing:
             observations[key] = np.concatenate([numbers_TX[:, begin:end], numbers_TX[-1:, begin:end]])
             begin = end
         terminated, truncated = self._last.terminated, self._last.truncated
-        actions_TA, rewards_T = numbers_TX[:, begin:-1], numbers_TX[:, -1]
-        return Episode(observations, actions_TA, rewards_T, terminated, truncated or not terminated)
+        actions, rewards_T = numbers_TX[:, begin:-1], numbers_TX[:, -1]
+        if self._columns.choices is not None:
+            actions = actions[:, 0].astype(np.int64)
+        return Episode(observations, actions, rewards_T, terminated, truncated or not terminated)
 
 
 def _check_new(name: str, names: set[str]) -> None:

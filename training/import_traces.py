@@ -104,8 +104,10 @@ def _observation_space(columns: ColumnMap) -> spaces.Space:
     return boxes[""] if "" in boxes else spaces.Dict(boxes)
 
 
-def _action_space(columns: ColumnMap, imported: Imported) -> spaces.Box:
-    """The range that the column map says; where it says none, the range seen. Raises SourceError for none at all."""
+def _action_space(columns: ColumnMap, imported: Imported) -> spaces.Space:
+    """Choices or a range, as the column map says; where it says none, the range seen. Raises SourceError for none."""
+    if columns.choices is not None:
+        return spaces.Discrete(columns.choices)
     declared_A = columns.action_range
     low_A, high_A = (
         np.where(np.abs(declared) < LARGEST, declared, seen).astype(np.float32)

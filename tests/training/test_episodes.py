@@ -45,6 +45,23 @@ def test_parts_and_lists() -> None:
     np.testing.assert_array_equal(episode.actions, [[0, -1], [0.0625, -1]])
 
 
+CHOICE = {"action": [{"column": "key", "choices": 3}]}
+
+
+def test_a_choice_is_a_whole_number_a_timestep() -> None:
+    log = [row | {"key": key} for row, key in zip(rows(4), (2, 0.0, True, 1), strict=True)]
+    (episode,) = read(log, column_map(**CHOICE))
+    assert episode.actions.tolist() == [2, 0, 1, 1]
+    assert episode.actions.dtype == np.int64
+
+
+@pytest.mark.parametrize("key", [3, -1, 0.5, None, "1", float("nan")])
+def test_refuses_what_is_no_choice(key: object) -> None:
+    log = [row | {"key": 0} for row in rows(3)]
+    with pytest.raises(SourceError, match=r"^row 1: column 'key' .*expected a whole number from 0 to 2, as the column"):
+        read(changed(log, 1, key=key), column_map(**CHOICE))
+
+
 @pytest.mark.parametrize(
     ("flags", "fields", "ends"),
     [

@@ -126,6 +126,20 @@ def test_a_range_that_is_half_told_is_completed_by_the_log(tmp_path: Path) -> No
     assert dataset.action_space == spaces.Box(np.float32([-3, 0]), np.float32([1, 2]))
 
 
+def test_choices_are_a_discrete_action_of_minari_and_of_training(tmp_path: Path) -> None:
+    """The log has choices 0 and 1 of three; what was never taken can still be learned."""
+    columns = column_map(action=[{"column": "fire", "choices": 3}])
+    told, dataset = imported(tmp_path, write_csv(tmp_path / "log.csv", SEVERAL), columns)
+    assert [values.tolist() for values in told.action_range] == [[0], [1]]
+    assert dataset.action_space == spaces.Discrete(3)
+    assert dataset[0].actions.tolist() == [0, 1, 0]
+    assert dataset.action_space.contains(dataset[0].actions[1])
+    features = FeatureMap((MappedFeature("health", (0,)), MappedFeature("speed", (1,), cost_us=2.0)))
+    traces = load_traces(tmp_path / "csv-v0", feature_map=features)
+    assert traces.actions_SA[:3].tolist() == [[0], [1], [0]]
+    assert traces.layout.choices == 3
+
+
 def test_training_reads_it_with_a_feature_map(tmp_path: Path) -> None:
     imported(tmp_path, write_csv(tmp_path / "log.csv", SEVERAL), column_map())
     features = FeatureMap((MappedFeature("health", (0,)), MappedFeature("speed", (1,), cost_us=2.0)))
