@@ -78,7 +78,7 @@ def _ways(config: TrainConfig, state: TrainState, costs_M: torch.Tensor) -> dict
 
     def loss(sampled: Rollout, drawn: Drawn) -> torch.Tensor:
         batch = drawn.batch
-        penalised, _ = Control.of("algorithm-1", 1.0, 1).penalty(
+        penalised = Control.of("algorithm-1", 1.0, 1).penalty(
             query_cost(sampled.query_BTM, costs_M), drawn.target_B, drawn.stratum_B, batch.valid_BT
         )
         delta = action_loss(model.action_head.losses(sampled.hidden_BTW, batch.actions_BTA), batch.valid_BT)

@@ -55,9 +55,10 @@ class Spent(NamedTuple):
     valid_BT: Tensor
 
     def means(self, strata: int) -> dict[str, float]:
-        """Mean cost asked for; of each of so many strata as a share of its C as well."""
+        """φ of Eq. 2 and the mean cost asked for; of each of so many strata as a share of its C as well."""
         counted_BT, valid_BT = self.cost_BT * self.valid_BT, self.valid_BT
-        means = {"cost": (counted_BT.sum() / valid_BT.sum()).item()}
+        phi = penalty(self.cost_BT, self.target_B[:, None], valid_BT)
+        means = {"phi": phi.item(), "cost": (counted_BT.sum() / valid_BT.sum()).item()}
         for i in range(strata):
             rows = self.stratum_B == i
             if rows.any():
@@ -79,13 +80,12 @@ class Control:
         """γ before the first batch: zero as printed, or small."""
         return cls(kind, step, [0.0 if kind == "algorithm-1" else _FIRST_WEIGHT] * strata)
 
-    def penalty(self, cost_BT: Tensor, target_B: Tensor, stratum_B: Tensor, valid_BT: Tensor) -> tuple[Tensor, Tensor]:
-        """(what is added to Δ, φ of Eq. 2), scalars."""
+    def penalty(self, cost_BT: Tensor, target_B: Tensor, stratum_B: Tensor, valid_BT: Tensor) -> Tensor:
+        """What is added to Δ, a scalar."""
         weight_BT = torch.tensor(self.weights, device=cost_BT.device)[stratum_B][:, None] * valid_BT
-        phi = penalty(cost_BT, target_B[:, None], valid_BT)
         if self.kind == "algorithm-1":
-            return penalty(cost_BT, target_B[:, None], valid_BT, weight_BT), phi
-        return (weight_BT * (cost_BT - target_B[:, None])).sum() / valid_BT.sum(), phi
+            return penalty(cost_BT, target_B[:, None], valid_BT, weight_BT)
+        return (weight_BT * (cost_BT - target_B[:, None])).sum() / valid_BT.sum()
 
     def means(self) -> dict[str, float]:
         """γ, and that of each stratum where there are several."""

@@ -6,6 +6,7 @@ This module knows nothing about networks. Shape letters as in `training.traces`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,26 +15,37 @@ from torch import Tensor
 from training import workers
 from training.config import TrainConfig
 from training.control import draw_costs
-from training.traces import EVERY_WINDOW, Batch, Traces, draw_windows
+from training.traces import Batch, Traces, choose_windows, read_windows
 
-__all__ = ["Drawn", "draw", "draw_share"]
+__all__ = ["Drawn", "Whole", "draw", "draw_share"]
+
+
+class Whole(NamedTuple):
+    """What every worker knows of a batch that they share."""
+
+    target_B: Tensor  # C of each window
+    stratum_B: Tensor  # and which γ it has
+    valid_BT: Tensor
+    last_BT: Tensor
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A batch, and what chance gave it."""
+    """A worker's part of a batch, and what chance gave it."""
 
     batch: Batch
-    target_B: Tensor  # C of each window
-    stratum_B: Tensor  # and which γ it has
+    target_B: Tensor
+    stratum_B: Tensor
     uniforms_BTM: Tensor
+    whole: Whole
 
 
-def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator, rows: slice = EVERY_WINDOW) -> Drawn:
-    """Windows, their target costs and the noise of their queries; of a whole batch `rows` are read."""
-    batch = draw_windows(traces, config.batch, config.window, chance, rows, config.beginnings)
+def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator, rows: slice = slice(None)) -> Drawn:
+    """A batch is drawn whole; `rows` of it are read."""
+    windows = choose_windows(traces, config.batch, config.window, chance, config.beginnings)
     shape = (config.batch, config.window, traces.layout.features.n_queries)
     uniforms = torch.from_numpy(chance.random(shape, dtype=np.float32)[rows]).to(config.device)
+    batch = read_windows(traces, windows.rows(rows))
     # Past an episode's end nothing is asked for, so that padding takes nothing of a budget that windows share.
     uniforms = torch.where(batch.valid_BT[..., None] > 0.0, uniforms, 1.0)
     together = _together(config)
@@ -41,8 +53,9 @@ def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator, rows:
     if config.budgets:
         drawn = draw_costs(config.budgets, config.batch // together, chance)
         targets, strata = (part.repeat(together) for part in drawn)
-    targets, strata = (torch.from_numpy(part[rows]).to(config.device) for part in (targets, strata))
-    return Drawn(batch, targets, strata, uniforms)
+    known = (torch.from_numpy(targets), torch.from_numpy(strata), windows.valid_BT, windows.last_BT)
+    whole = Whole(*(part.to(config.device) for part in known))
+    return Drawn(batch, whole.target_B[rows], whole.stratum_B[rows], uniforms, whole)
 
 
 def draw_share(config: TrainConfig, traces: Traces, chance: np.random.Generator) -> Drawn:

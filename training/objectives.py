@@ -28,8 +28,7 @@ def penalty(cost_BT: Tensor, budget: float | Tensor, valid_BT: Tensor, weight_BT
     return excess.sum() / valid_BT.sum()
 
 
-def action_loss(losses_BT: Tensor, valid_BT: Tensor, weight_BT: Tensor | None = None) -> Tensor:
-    """Δ: the mean over timesteps that are not padding of -log π̃(a_t | ...). Scalar. `weight_BT` says how much each
-    timestep's action is worth imitating (IQL's advantage weight; None: all the same)."""
-    counted_BT = valid_BT if weight_BT is None else valid_BT * weight_BT
-    return (losses_BT * counted_BT).sum() / valid_BT.sum()
+def action_loss(losses_BT: Tensor, valid_BT: Tensor) -> Tensor:
+    """Δ: the mean over timesteps that are not padding of -log π̃(a_t | ...), or of as much of it as an action is worth
+    imitating. Scalar."""
+    return (losses_BT * valid_BT).sum() / valid_BT.sum()

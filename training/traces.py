@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,9 +22,8 @@ from training.feature_map import FeatureMap
 from training.statistics import Statistics, Tally
 from training.steps import Layout, Recordings, Steps
 
-__all__ = ["EVERY_WINDOW", "EXAMPLES", "Batch", "Traces", "choose_example", "draw_windows", "load_traces"]
+__all__ = ["EXAMPLES", "Batch", "Traces", "Windows", "choose_example", "choose_windows", "load_traces", "read_windows"]
 
-EVERY_WINDOW = slice(None)
 EXAMPLES = 8  # episodes looked at when one is chosen
 _EXAMPLE_STEPS = 128
 
@@ -86,6 +86,28 @@ class Traces:
         )
 
 
+class Windows(NamedTuple):
+    """Where windows are."""
+
+    first_B: NDArray[np.int64]  # step at which the episode begins
+    length_B: NDArray[np.int64]  # of the episode
+    step_BT: NDArray[np.int64]  # of the episode, past its end as well
+
+    def rows(self, rows: slice) -> Windows:
+        """Some of them."""
+        return Windows(*(part[rows] for part in self))
+
+    @property
+    def valid_BT(self) -> Tensor:
+        """0 past an episode's end."""
+        return torch.from_numpy((self.step_BT < self.length_B[:, None]).astype(np.float32))
+
+    @property
+    def last_BT(self) -> Tensor:
+        """1 at an episode's last timestep."""
+        return torch.from_numpy((self.step_BT == self.length_B[:, None] - 1).astype(np.float32))
+
+
 @dataclass(frozen=True)
 class Batch:
     """A batch of windows; timesteps past an episode's end are padding (`valid` 0)."""
@@ -116,17 +138,11 @@ def load_traces(*paths: Path, episodes: int | None = None, feature_map: FeatureM
     return Traces(recordings.layout, *Steps.joined(read), starts_E, lengths_E)
 
 
-def draw_windows(
-    traces: Traces,
-    batch: int,
-    length: int,
-    generator: np.random.Generator,
-    rows: slice = EVERY_WINDOW,
-    beginnings: float = 0.0,
-) -> Batch:
-    """Windows [B, T] of a batch: an episode in proportion to its length, then a start that lets its first timesteps be
-    seen as often as the others, but for the share `beginnings` of the windows, which start where their episode does.
-    The batch is drawn whole; `rows` of it are read."""
+def choose_windows(
+    traces: Traces, batch: int, length: int, generator: np.random.Generator, beginnings: float = 0.0
+) -> Windows:
+    """Windows [B, T]: an episode in proportion to its length, then a start that lets its first timesteps be seen as
+    often as the others, but for the share `beginnings` of the windows, which start where their episode does."""
     share = traces.lengths_E / traces.lengths_E.sum()
     episode_B = generator.choice(len(share), size=batch, p=share)
     length_B = traces.lengths_E[episode_B]
@@ -134,17 +150,19 @@ def draw_windows(
     start_B = start_B.clip(0, np.maximum(length_B - length, 0))
     if beginnings:
         start_B[generator.random(batch) < beginnings] = 0
-    episode_B, length_B, start_B = episode_B[rows], length_B[rows], start_B[rows]
-    step_BT = start_B[:, None] + np.arange(length)
-    valid_BT = step_BT < length_B[:, None]
+    return Windows(traces.starts_E[episode_B], length_B, start_B[:, None] + np.arange(length))
+
+
+def read_windows(traces: Traces, windows: Windows) -> Batch:
+    """The numbers of windows."""
     device = traces.free_SF.device
-    index_BT = torch.from_numpy(traces.starts_E[episode_B][:, None] + np.minimum(step_BT, length_B[:, None] - 1))
-    index_BT = index_BT.to(device)
+    index_BT = windows.first_B[:, None] + np.minimum(windows.step_BT, windows.length_B[:, None] - 1)
+    index_BT = torch.from_numpy(index_BT).to(device)
     return Batch(
         traces.free_SF[index_BT],
         traces.costly_SD[index_BT].float(),
         traces.actions_SA[index_BT],
         traces.returns_to_go_S[index_BT][..., None],
-        torch.from_numpy((step_BT == length_B[:, None] - 1).astype(np.float32)).to(device),
-        torch.from_numpy(valid_BT.astype(np.float32)).to(device),
+        windows.last_BT.to(device),
+        windows.valid_BT.to(device),
     )

@@ -32,7 +32,7 @@ from training.objectives import action_loss, query_cost
 from training.policy import BudgetedPolicy, Known
 from training.record import RunRecord, write_versions
 from training.trace_source import TraceSource, open_traces
-from training.traces import Batch, Traces
+from training.traces import Traces
 
 __all__ = ["Pass", "TrainState", "know", "main", "new_state", "train", "update"]
 
@@ -113,45 +113,52 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tens
     is the run that was stopped."""
     model, control = state.model, state.control
     drawn = draw_share(config, traces, np.random.default_rng([config.seed, state.done]))
-    valid_BT, counted = drawn.batch.valid_BT, workers.weigh(drawn.batch.valid_BT)
+    valid_BT, whole = drawn.batch.valid_BT, drawn.whole
     state.optimiser.zero_grad(set_to_none=True)
-    weight_BT = _critics_update(state, drawn.batch, counted)
+    weight_BT = _critics_update(state, drawn)
     sampled, losses_BT, passes = state.forward(drawn)
-    delta = action_loss(losses_BT, valid_BT, weight_BT)
-    # What is asked for counts, and not what allocation left of it: the network must learn to ask for what it may have.
-    # The gradient is that of the query.
-    asked_BTM = (drawn.uniforms_BTM < sampled.probs_BTM).to(costs_M.dtype)
-    asked_BTM = sampled.query_BTM + (asked_BTM - sampled.query_BTM).detach()
-    cost_BT = query_cost(asked_BTM, costs_M)
-    penalised, phi = control.penalty(cost_BT, drawn.target_B, drawn.stratum_B, valid_BT)
+    if weight_BT is not None:
+        losses_BT = losses_BT * weight_BT
+    cost_BT = _asked_cost(sampled, drawn, costs_M)
     # γφ depends on the queries alone, so it moves the acquisition path and leaves the action head as it is.
-    loss = counted * (delta + penalised)
+    penalised = control.penalty(cost_BT, drawn.target_B, drawn.stratum_B, valid_BT)
+    loss = workers.weigh(valid_BT, whole.valid_BT) * (action_loss(losses_BT, valid_BT) + penalised)
     backward(sampled, loss, config.sweeps if model.config.has_memory else 1, list(model.parameters()))
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, state.done)
     state.optimiser.step()
-    spent = Spent(*(workers.gather(part) for part in (cost_BT.detach(), drawn.target_B, drawn.stratum_B, valid_BT)))
+    cost_BT, losses_BT = workers.gather(torch.stack([cost_BT, losses_BT], dim=-1).detach()).unbind(-1)
+    spent = Spent(cost_BT, whole.target_B, whole.stratum_B, whole.valid_BT)
     if config.acquisition == "learned":
         control.observe(*spent)
     state.done += 1
-    means = workers.gather(counted * torch.stack([delta.detach(), phi.detach()])[None]).mean(0)
-    state.metrics = {"delta": means[0].item(), "phi": means[1].item(), **spent.means(max(len(config.budgets) - 1, 0))}
-    state.metrics |= {"passes": float(passes), "gradient_norm": float(norm), **control.means()}
+    delta, n_strata = action_loss(losses_BT, whole.valid_BT).item(), max(len(config.budgets) - 1, 0)
+    state.metrics = {"delta": delta, **spent.means(n_strata), "passes": float(passes), "gradient_norm": float(norm)}
+    state.metrics |= control.means()
 
 
-def _critics_update(state: TrainState, batch: Batch, counted: Tensor | float) -> Tensor | None:
+def _asked_cost(sampled: Rollout, drawn: Drawn, costs_M: Tensor) -> Tensor:
+    """Cost of what was asked for, [B, T], and not of what allocation left of it: the network must learn to ask for what
+    it may have. The gradient is that of the query."""
+    asked_BTM = (drawn.uniforms_BTM < sampled.probs_BTM).to(costs_M.dtype)
+    return query_cost(sampled.query_BTM + (asked_BTM - sampled.query_BTM).detach(), costs_M)
+
+
+def _critics_update(state: TrainState, drawn: Drawn) -> Tensor | None:
     """One step of IQL's critics; the weight of each timestep's action, [B, T]."""
     if state.critics is None or state.judge is None or state.critic_optimiser is None:
         return None
-    model, critics = state.model, state.critics
+    model, critics, batch, whole = state.model, state.critics, drawn.batch, drawn.whole
     with torch.no_grad():
         context = model.context(batch.free_BTF, batch.returns_to_go_BT1)
         everything = torch.cat([context, model.normalise_costly(batch.costly_BTD)], dim=-1)
     state.critic_optimiser.zero_grad(set_to_none=True)
-    togo_BT, taught_BT = batch.returns_to_go_BT1[..., 0], taught(batch.last_BT, batch.valid_BT)
+    togo_BT = batch.returns_to_go_BT1[..., 0]
     value_loss, q_loss = state.judge(everything, batch.actions_BTA, togo_BT, batch.last_BT, batch.valid_BT)
-    (counted * value_loss + workers.weigh(taught_BT) * q_loss).backward()
+    value_weight = workers.weigh(batch.valid_BT, whole.valid_BT)
+    q_weight = workers.weigh(taught(batch.last_BT, batch.valid_BT), taught(whole.last_BT, whole.valid_BT))
+    (value_weight * value_loss + q_weight * q_loss).backward()
     state.critic_optimiser.step()
     critics.follow()
     return critics.weights(everything, batch.actions_BTA)

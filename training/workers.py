@@ -58,7 +58,7 @@ def spread(module: nn.Module, unused: bool = False) -> nn.Module:
     """The module; gradients of its parameters are averaged over the workers. `unused`: some of them have none."""
     if count() == 1:
         return module
-    return DistributedDataParallel(module, broadcast_buffers=False, find_unused_parameters=unused)
+    return DistributedDataParallel(module, forward_sync_buffers=False, find_unused_parameters=unused)
 
 
 def gather(x_B: Tensor) -> Tensor:
@@ -70,8 +70,7 @@ def gather(x_B: Tensor) -> Tensor:
     return torch.cat(parts)
 
 
-def weigh(mask_BT: Tensor) -> Tensor | float:
-    """What a mean over this worker's mask must be multiplied by, for the mean over workers to be that of all masks."""
-    if count() == 1:
-        return 1.0
-    return mask_BT.sum() * count() / gather(mask_BT).sum().clamp(min=1.0)
+def weigh(own_BT: Tensor, whole_BT: Tensor) -> Tensor:
+    """What a mean over this worker's mask must be multiplied by, for the mean over workers to be that over the whole
+    batch's mask. 1 where there is one worker."""
+    return own_BT.sum() * count() / whole_BT.sum().clamp(min=1.0)

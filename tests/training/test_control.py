@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from training.control import Control, draw_costs
+from training.control import Control, Spent, draw_costs
 
 ONES = torch.ones(1, 1)
 ONLY = torch.zeros(1, dtype=torch.long)
@@ -62,15 +62,15 @@ def test_each_stratum_has_its_own_weight_and_padding_is_not_spent() -> None:
     target, stratum = torch.tensor([0.5, 0.5, 0.5]), torch.tensor([0, 1, 1])
     control.observe(cost, target, stratum, valid)
     assert control.weights == [1.0, 0.0, 0.0]
-    added, phi = control.penalty(cost, target, stratum, valid)
-    assert phi.item() == pytest.approx(0.4 / 5)
+    added = control.penalty(cost, target, stratum, valid)
+    assert Spent(cost, target, stratum, valid).means(0)["phi"] == pytest.approx(0.4 / 5)
     assert added.item() == pytest.approx(0.4 / 5)
 
 
 def test_dual_penalty_is_the_signed_excess_of_the_mean() -> None:
     control = Control("dual", 0.01, [2.0, 10.0])
     cost, target = torch.tensor([[0.2, 0.4], [0.0, 0.0]]), torch.tensor([0.1, 0.05])
-    added, _ = control.penalty(cost, target, torch.tensor([0, 1]), torch.ones(2, 2))
+    added = control.penalty(cost, target, torch.tensor([0, 1]), torch.ones(2, 2))
     assert added.item() == pytest.approx((2.0 * (0.1 + 0.3) - 10.0 * 0.1) / 4)
 
 

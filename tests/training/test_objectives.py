@@ -43,9 +43,3 @@ def test_straight_through_is_the_sample_in_value_and_the_probability_in_gradient
     (query * torch.tensor([3.0, 5.0])).sum().backward()
     assert probs.grad is not None
     assert probs.grad.tolist() == [3.0, 5.0]
-
-
-def test_a_timestep_that_is_worth_more_counts_more() -> None:
-    losses, valid = torch.tensor([[2.0, 4.0, 8.0]]), torch.tensor([[1.0, 1.0, 0.0]])
-    weighted = action_loss(losses, valid, torch.tensor([[3.0, 0.5, 100.0]]))
-    assert weighted.item() == pytest.approx((3.0 * 2.0 + 0.5 * 4.0) / 2)

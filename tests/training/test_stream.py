@@ -15,7 +15,7 @@ import torch
 from tests.training import toy
 from tests.training.test_train import train_interrupted
 from training.stream import Pooling, Stream
-from training.traces import Traces, draw_windows, load_traces
+from training.traces import Traces, load_traces
 from training.train import train
 
 SMALL = Pooling(pool_mb=0.02, draws=64, seed=0)  # three row groups of the toy's ten
@@ -38,7 +38,7 @@ def test_windows_are_windows_of_the_dataset(dataset: Path, shards: Path) -> None
     known, last_S = known_rows(traces), set((traces.starts_E + traces.lengths_E - 1).tolist())
     starts = set(traces.starts_E.tolist())
     for update in range(30):
-        batch = draw_windows(stream.pool(update), 8, 9, chance)
+        batch = toy.windows(stream.pool(update), 8, 9, chance)
         parts = (batch.free_BTF, batch.costly_BTD, batch.actions_BTA, batch.returns_to_go_BT1)
         at = np.array([known[row] for row in rows(tuple(part.flatten(0, 1) for part in parts))]).reshape(8, 9)
         valid = batch.valid_BT.bool().numpy()
@@ -55,7 +55,7 @@ def test_every_timestep_is_drawn_about_as_often(dataset: Path, shards: Path) -> 
     known, chance = known_rows(traces), np.random.default_rng(0)
     counts = np.zeros(len(known))
     for update in range(500):
-        batch = draw_windows(stream.pool(update), 64, 1, chance)
+        batch = toy.windows(stream.pool(update), 64, 1, chance)
         parts = (batch.free_BTF, batch.costly_BTD, batch.actions_BTA, batch.returns_to_go_BT1)
         for row in rows(tuple(part.flatten(0, 1) for part in parts)):
             counts[known[row]] += 1
@@ -70,7 +70,7 @@ def test_the_pool_of_an_update_does_not_depend_on_those_before(shards: Path) -> 
         pool = walked.pool(update)
         if update % 6 == 0:
             fresh = Stream.open(shards, SMALL).pool(update)
-            one, other = (draw_windows(traces, 16, 5, np.random.default_rng(1)) for traces in (pool, fresh))
+            one, other = (toy.windows(traces, 16, 5, np.random.default_rng(1)) for traces in (pool, fresh))
             assert torch.equal(one.costly_BTD, other.costly_BTD)
 
 

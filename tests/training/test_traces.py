@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from tests.training import toy
 from training.datasets import TracesError
 from training.steps import returns_to_go
-from training.traces import draw_windows, load_traces
+from training.traces import load_traces
 
 
 @given(st.lists(st.floats(-100, 100), min_size=1, max_size=30))
@@ -43,7 +43,7 @@ def test_windows_stay_inside_their_episode_and_mark_padding(dataset: Path) -> No
     traces = load_traces(dataset)
     generator, starts = np.random.default_rng(0), set()
     for _ in range(20):
-        batch = draw_windows(traces, 64, 12, generator)
+        batch = toy.windows(traces, 64, 12, generator)
         valid = batch.valid_BT.bool()
         assert valid[:, 0].all()
         clock = batch.free_BTF[..., 1]
@@ -56,7 +56,7 @@ def test_held_out_episodes_are_never_drawn(dataset: Path) -> None:
     kept, rest = load_traces(dataset).split(0.25)
     assert (len(kept.lengths_E), len(rest.lengths_E)) == (30, 10)
     generator, boundary = np.random.default_rng(0), int(rest.starts_E[0])
-    seen = torch.cat([draw_windows(kept, 64, 12, generator).costly_BTD.flatten(0, 1) for _ in range(20)])
+    seen = torch.cat([toy.windows(kept, 64, 12, generator).costly_BTD.flatten(0, 1) for _ in range(20)])
     drawn = {tuple(row) for row in seen.tolist()}
     assert drawn <= {tuple(row) for row in kept.costly_SD[:boundary].float().tolist()}
 
@@ -152,7 +152,7 @@ def test_a_share_of_the_windows_begins_with_the_episode(dataset: Path) -> None:
     marked = replace(traces, free_SF=first_S1)
     shares = []
     for beginnings in (0.0, 0.5, 1.0):
-        batch = draw_windows(marked, 2000, 3, np.random.default_rng(0), beginnings=beginnings)
+        batch = toy.windows(marked, 2000, 3, np.random.default_rng(0), beginnings=beginnings)
         shares.append(batch.free_BTF[:, 0, 0].mean().item())
     assert shares[0] < 0.2
     assert shares[1] == pytest.approx(0.5 * (1.0 + shares[0]), abs=0.03)

@@ -18,6 +18,7 @@ from minari.data_collector.episode_buffer import EpisodeBuffer
 
 from protocol.features import ActionComponent, ActionSpec, Feature, FeatureTable
 from training.config import TrainConfig
+from training.traces import Batch, Traces, choose_windows, read_windows
 
 FEATURES = FeatureTable(
     (
@@ -76,6 +77,11 @@ def write_dataset(root: Path, monkeypatch: pytest.MonkeyPatch, episodes: int = 4
         {"features": msgspec.json.encode(FEATURES).decode(), "action": msgspec.json.encode(ACTION).decode()}
     )
     return root / "toy" / "test-v0"
+
+
+def windows(traces: Traces, batch: int, length: int, generator: np.random.Generator, beginnings: float = 0.0) -> Batch:
+    """Windows of traces, drawn and read."""
+    return read_windows(traces, choose_windows(traces, batch, length, generator, beginnings))
 
 
 def config(dataset: Path, out: Path, **settings: object) -> TrainConfig:
