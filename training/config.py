@@ -34,6 +34,8 @@ class TrainConfig:
     held_out: float = 0.04  # share of the episodes, the last ones, that only measure the loss
     pool_mb: float = 1024.0  # most memory for traces where they are streamed, from a folder of training.shards
 
+    keyframes: Path | None = None  # a run that acquires nothing: frames that it gets wrong count more
+
     method: Literal["bdt", "rcbc", "bc", "iql"] = "bdt"
     acquisition: Literal["learned", "random", "all", "none"] = "learned"  # learn the queries, draw them, or force them
     budget: float = 0.1  # C: most that a query may cost, as a share of the full cost (Eq. 1)

@@ -39,6 +39,7 @@ class Traces:
     returns_to_go_S: Tensor
     starts_E: NDArray[np.int64]  # first step of each episode
     lengths_E: NDArray[np.int64]
+    weights_S: Tensor | None = None  # how much each timestep's action counts; None: all the same
 
     def __len__(self) -> int:
         """How many episodes there are."""
@@ -74,7 +75,8 @@ class Traces:
 
     def to(self, device: str) -> Traces:
         """The same traces with their numbers on `device`."""
-        names = ("free_SF", "costly_SD", "actions_SA", "returns_to_go_S")
+        names = ["free_SF", "costly_SD", "actions_SA", "returns_to_go_S"]
+        names += [] if self.weights_S is None else ["weights_S"]
         return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def split(self, share: float) -> tuple[Traces, Traces]:
@@ -118,6 +120,7 @@ class Batch:
     returns_to_go_BT1: Tensor
     last_BT: Tensor  # 1 at an episode's last timestep
     valid_BT: Tensor
+    weight_BT: Tensor  # how much each action counts
 
 
 def choose_example(episodes: list[Steps]) -> Steps:
@@ -158,11 +161,13 @@ def read_windows(traces: Traces, windows: Windows) -> Batch:
     device = traces.free_SF.device
     index_BT = windows.first_B[:, None] + np.minimum(windows.step_BT, windows.length_B[:, None] - 1)
     index_BT = torch.from_numpy(index_BT).to(device)
+    valid_BT = windows.valid_BT.to(device)
     return Batch(
         traces.free_SF[index_BT],
         traces.costly_SD[index_BT].float(),
         traces.actions_SA[index_BT],
         traces.returns_to_go_S[index_BT][..., None],
         windows.last_BT.to(device),
-        windows.valid_BT.to(device),
+        valid_BT,
+        torch.ones_like(valid_BT) if traces.weights_S is None else traces.weights_S[index_BT],
     )

@@ -28,6 +28,7 @@ from training.config import TrainConfig
 from training.control import Control, Spent
 from training.draws import Drawn, draw, draw_share
 from training.iql import Critics, taught
+from training.keyframes import weigh_keyframes
 from training.objectives import action_loss, query_cost
 from training.policy import BudgetedPolicy, Known
 from training.record import RunRecord, write_versions
@@ -117,8 +118,7 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tens
     state.optimiser.zero_grad(set_to_none=True)
     weight_BT = _critics_update(state, drawn)
     sampled, losses_BT, passes = state.forward(drawn)
-    if weight_BT is not None:
-        losses_BT = losses_BT * weight_BT
+    losses_BT = losses_BT * (drawn.batch.weight_BT if weight_BT is None else drawn.batch.weight_BT * weight_BT)
     cost_BT = _asked_cost(sampled, drawn, costs_M)
     # γφ depends on the queries alone, so it moves the acquisition path and leaves the action head as it is.
     penalised = control.penalty(cost_BT, drawn.target_B, drawn.stratum_B, valid_BT)
@@ -178,7 +178,10 @@ def train(config: TrainConfig) -> TrainState:
     if (config.out / "checkpoint.pt").exists():
         load_checkpoint(config.out / "checkpoint.pt", config, state)
     _check_together(config, state)
-    training, held_out = traces.to(config.device).split(config.held_out)
+    training, held_out = traces.split(config.held_out)
+    if config.keyframes is not None:
+        training = _weigh(config.keyframes, training)
+    training, held_out = training.to(config.device), held_out.to(config.device)
     costs_M = _costs(config, traces)
     with nullcontext() if workers.rank() else _begin_record(config, state, traces, held_out) as run:
         while state.done < config.updates:
@@ -186,6 +189,12 @@ def train(config: TrainConfig) -> TrainState:
             if run is not None:
                 run.record()
     return state
+
+
+def _weigh(run: Path, traces: TraceSource) -> Traces:
+    if not isinstance(traces, Traces):
+        raise ValueError("keyframes weigh traces in memory, and these are streamed from shards")
+    return weigh_keyframes(run, traces)
 
 
 def _costs(config: TrainConfig, traces: TraceSource) -> Tensor:
