@@ -95,7 +95,8 @@ def test_refuses_datasets_with_other_actions(cartpole: Path, tmp_path: Path) -> 
     shutil.copytree(cartpole, other)
     file = other / "data" / "metadata.json"
     metadata = json.loads(file.read_text())
-    file.write_text(json.dumps(metadata | {"action_space": json.dumps({"type": "Discrete", "dtype": "int64", "n": 3, "start": 0})}))
+    space = {"type": "Discrete", "dtype": "int64", "n": 3, "start": 0}
+    file.write_text(json.dumps(metadata | {"action_space": json.dumps(space)}))
     with pytest.raises(TracesError, match="have other features or other actions"):
         load_traces(cartpole, other, feature_map=MAP)
 

@@ -69,7 +69,7 @@ def test_a_run_learns_from_weighed_frames(dataset: Path, blind: Path, tmp_path: 
 def test_refuses_a_run_that_is_not_blind(
     dataset: Path, trained: tuple[Path, object], blind: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(ValueError, match="has acquisition learned and bins .* expected none"):
+    with pytest.raises(ValueError, match=r"has acquisition learned and bins .* expected none"):
         weigh_keyframes(trained[0], load_traces(dataset))
     with pytest.raises(FileNotFoundError, match="does not exist"):
         train(toy.config(dataset, tmp_path / "run", updates=1, keyframes=tmp_path / "nowhere"))
