@@ -181,7 +181,7 @@ def train(config: TrainConfig) -> TrainState:
     training, held_out = traces.split(config.held_out)
     if config.keyframes is not None:
         training = _weigh(config.keyframes, training)
-    training, held_out = training.to(config.device), held_out.to(config.device)
+    training, held_out = training.to(config.device), _draw_held_out(config, held_out)
     costs_M = _costs(config, traces)
     with nullcontext() if workers.rank() else _begin_record(config, state, traces, held_out) as run:
         while state.done < config.updates:
@@ -207,16 +207,21 @@ def _check_together(config: TrainConfig, state: TrainState) -> None:
         raise ValueError(f"workers are at updates {done}, expected one: they must share the folder {config.out}")
 
 
-def _begin_record(config: TrainConfig, state: TrainState, traces: TraceSource, held_out: TraceSource) -> RunRecord:
+def _draw_held_out(config: TrainConfig, held_out: TraceSource) -> Drawn | None:
+    """One batch: the same windows and the same noise every time, and no pool beside that of what is trained on."""
+    if not len(held_out):
+        return None
+    return draw(config, held_out.to(config.device).pool(0), np.random.default_rng(config.seed))
+
+
+def _begin_record(config: TrainConfig, state: TrainState, traces: TraceSource, held_out: Drawn | None) -> RunRecord:
     config.out.mkdir(parents=True, exist_ok=True)
     config.write(config.out / "config.json")
     write_versions(config.out / "versions.json", traces.statistics, workers.count())
-    forward, drawn = Pass(config, state.model, _costs(config, traces)), None
-    if len(held_out):  # the same windows and the same noise every time
-        drawn = draw(config, held_out.pool(0), np.random.default_rng(config.seed))
+    forward = Pass(config, state.model, _costs(config, traces))
 
     def measure() -> dict[str, float]:
-        return {} if drawn is None else {"held_out": held_out_loss(forward, drawn)}
+        return {} if held_out is None else {"held_out": held_out_loss(forward, held_out)}
 
     return RunRecord(config, state, Facts.of(traces, config.target_return), measure)
 
