@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bot_runtime import budget
+from bot_runtime import budget, greedy
 from bot_runtime.budget import allocate
 from protocol.features import CostModel
 
@@ -119,13 +119,25 @@ def test_what_is_worth_least_of_all_is_still_asked_for_where_it_fits() -> None:
     assert allocate(probs, sampled, costs, 0.0, 0.1).tolist() == [[False, False, False, True]]
 
 
+def by_slope(probs: np.ndarray, sampled: np.ndarray, costs: np.ndarray, call: float) -> list[tuple[int, int]]:
+    """What all bots ask for: each bot's densest features up to the most that they are worth per µs with the call."""
+    slopes: dict[tuple[int, int], float] = {}
+    for bot in range(len(probs)):
+        features = sorted(np.flatnonzero(sampled[bot]).tolist(), key=lambda at: -probs[bot, at] / costs[at])
+        runs = [features[: k + 1] for k in range(len(features))]
+        worth = [probs[bot, run].sum() / (call + costs[run].sum()) for run in runs]
+        for k, feature in enumerate(features):
+            is_opening = k <= int(np.argmax(worth))
+            slopes[bot, feature] = max(worth) if is_opening else probs[bot, feature] / costs[feature]
+    return sorted(slopes, key=lambda at: -slopes[at])
+
+
 def sequential_greedy(
     probs: np.ndarray, sampled: np.ndarray, costs: np.ndarray, call: float, limit: float
 ) -> np.ndarray:
-    """All bots share `limit`: densest first, one at a time, skipping what does not fit."""
+    """All bots share `limit`: the steepest first, one at a time, skipping what does not fit."""
     query, spent = np.zeros_like(sampled), 0.0
-    order = sorted(np.argwhere(sampled).tolist(), key=lambda at: -probs[at[0], at[1]] / costs[at[1]])
-    for bot, feature in order:
+    for bot, feature in by_slope(probs, sampled, costs, call):
         price = costs[feature] + (0.0 if query[bot].any() else call)
         if spent + price <= limit:
             query[bot, feature] = True
@@ -136,7 +148,8 @@ def sequential_greedy(
 @pytest.mark.parametrize("call", [0.0, 3.0])
 def test_equals_greedy_one_feature_at_a_time(call: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whole-number costs, so that no sum is rounded; budgets half a µs above any sum, so that no margin matters."""
-    monkeypatch.setattr(budget, "_best_of_two", budget._greedy)
+    for name in ("_single_if_better", "_alone_if_better"):
+        monkeypatch.setattr(greedy, name, lambda chosen, *_: chosen)
     random = np.random.default_rng(7)
     for _ in range(300):
         n_bots, n_queries = random.integers(1, 6), random.integers(1, 9)
