@@ -2,7 +2,7 @@
 
 Minari datasets are read an episode at a time and written as Parquet (training/shard.py) with the statistics that
 training needs (training/shard_index.py), so that a run reads only what it draws from. OUT appears when all of it is
-written, or not at all. Memory is that of one row group and 8 bytes an episode, however many there are.
+written, or not at all. Memory is that of a row group, of the first episodes, and 4 bytes an episode.
 """
 
 from __future__ import annotations

@@ -75,19 +75,20 @@ class Recordings:
         for dataset in self._datasets[1:]:
             if (dataset.features, dataset.action) != (first.features, first.action):
                 raise TracesError(f"{dataset.path} and {first.path} have other features or other actions")
-        counts = [_count(dataset, episodes) for dataset in self._datasets]
-        self._wanted = sorted((i, which) for which, count in enumerate(counts) for i in range(count))
+        self._counts = [_count(dataset, episodes) for dataset in self._datasets]
         self.layout = Layout(first.features, first.action, first.choices, feature_map)
         self.names = ", ".join(dataset.path.name for dataset in self._datasets)
 
     def __len__(self) -> int:
         """How many episodes there are."""
-        return len(self._wanted)
+        return sum(self._counts)
 
     def __iter__(self) -> Iterator[Steps]:
         """Raises TracesError for an episode that does not match the feature table."""
-        for i, which in self._wanted:
-            yield _read(self._datasets[which], i)
+        for i in range(max(self._counts)):
+            for dataset, count in zip(self._datasets, self._counts, strict=True):
+                if i < count:
+                    yield _read(dataset, i)
 
 
 def _count(dataset: Dataset, episodes: int | None) -> int:
