@@ -16,6 +16,8 @@ from training import workers
 from training.config import TrainConfig
 from training.train import train
 
+pytestmark = pytest.mark.timeout(600)  # three processes start, on cores that others may be using
+
 CONDITIONED = {"budgets": (0.05, 0.3, 1.0), "control": "dual", "penalty_step": 0.05}
 RUNS: dict[str, dict[str, object]] = {
     "frame": {**CONDITIONED, "allocation": "frame", "frame_bots": 4},
@@ -66,12 +68,14 @@ def test_two_workers_train_and_tell_what_one_does(
     assert json.loads((shared / run / "versions.json").read_text())["workers"] == "2"
 
 
-def test_refuses_a_batch_that_cannot_be_shared_out(shared: Path) -> None:
+def test_refuses_a_batch_that_cannot_be_shared_out_and_a_folder_that_one_does_not_see(shared: Path) -> None:
     for rank in range(2):
-        assert (shared / f"refused_{rank}.txt").read_text().splitlines() == [
+        *batches, folder = (shared / f"refused_{rank}.txt").read_text().splitlines()
+        assert batches == [
             "batch 15 is not a multiple of 2 workers",
             "batch 16 is not a multiple of 2 workers times 16 windows that share a budget",
         ]
+        assert folder.startswith("workers are at updates [20, 0], expected one: they must share the folder")
 
 
 def test_a_process_of_its_own_has_no_group() -> None:
