@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 
+@pytest.mark.timeout(600)  # a process starts, on cores that others may be using
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak of memory is read from /proc")
 def test_memory_stays_bounded_whatever_the_size() -> None:
     """96 MB pass through a pool of 16 MB, all of them; the process grows by little more than the pool. The same in
