@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bot_runtime.bundle import Bundle
+from bot_runtime.context import Contexts
 from bot_runtime.noise import uniforms
 from bot_runtime.policy import Policy
 from protocol.features import CostModel
@@ -52,8 +53,12 @@ def trained(bundle: Bundle, golden_probs_TM: np.ndarray) -> Source:
             low, high = (np.clip(limit, -100.0, 100.0) for limit in table.free_range)
             free = random.uniform(low, high, (n_bots, table.n_free))
             returns_to_go = random.uniform(-1.0, 1.0, n_bots) * manifest.target_return
-            hidden = random.normal(0.0, 1.5, (n_bots, manifest.width))
-            probs = policy.query_probs(hidden, free, returns_to_go, random.random(n_bots))
+            batch = Contexts(manifest, n_bots).batch(np.arange(n_bots))
+            batch.past_NW[:] = random.normal(0.0, 1.5, (n_bots, manifest.width))
+            batch.free_NF[:], batch.left_N1[:, 0] = free, returns_to_go
+            batch.target_cost_N1[:] = random.random((n_bots, 1))
+            policy.query_probs(batch)
+            probs = batch.probs_NM
         return _priced(random, probs, declared.costs_us)
 
     return source

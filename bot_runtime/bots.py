@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bot_runtime import inputs
+from bot_runtime.batch import Batch
 from bot_runtime.budget import allocate
 from bot_runtime.bundle import Bundle
+from bot_runtime.company import Companies, Company, Means
 from bot_runtime.context import Contexts
 from bot_runtime.fallback import Counters, fallback_actions
-from bot_runtime.noise import uniforms
-from bot_runtime.policy import Policy, Step
+from bot_runtime.policy import Policy
 from bot_runtime.slots import Slots
 from bot_runtime.spending import Limits, Spending
 from bot_runtime.turns import Actions, Queries, Turn, Turns
@@ -32,6 +33,7 @@ __all__ = ["Bots"]
 
 _Handles = NDArray[np.int64]
 _Numbers = Sequence[float] | NDArray[np.floating] | None
+_NOTHING_SAID = Limits.checked(0, None, None)
 
 
 class Bots:
@@ -60,6 +62,8 @@ class Bots:
         self._contexts = Contexts(bundle.manifest, max_bots)
         self._turns = Turns(max_bots, self.counters)
         self._spending = Spending(bundle.manifest, max_bots)
+        self._companies = Companies(self._slots, self._contexts, self._spending)
+        self._checks = inputs.FeatureChecks(bundle.manifest.features, max_bots)
         self._started = 0
         self._low_A, self._high_A = bundle.manifest.action.range
 
@@ -123,21 +127,27 @@ class Bots:
         network's target cost is `Spending.terms`. A newer frame abandons a pending query. Raises BadShape, BadSchema,
         NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
         """
-        slots_N = self._slots.resolve(handles)
+        company = self._companies.named(handles, _NOTHING_SAID)
         check_frame(frame)
-        retried = self._turns.query(handles, slots_N, frame)
-        inputs.check_free(free_NF, handles, self.bundle.manifest.features)
-        rewards_N = np.zeros(handles.size) if rewards_N is None else rewards_N
-        rewards_N = inputs.per_bot("rewards", rewards_N, handles.size, -MAX_RETURN, MAX_RETURN)
-        limits = Limits.checked(handles.size, budgets_us, target_costs_us, frame_budget_us)
+        retried = self._turns.query(company, frame)
+        self._checks.free(free_NF, handles)
+        if rewards_N is None:
+            rewards_N = np.zeros(company.n_bots)
+        else:
+            rewards_N = inputs.per_bot("rewards", rewards_N, company.n_bots, -MAX_RETURN, MAX_RETURN)
+        limits, means = _NOTHING_SAID, company.means
+        if budgets_us is not None or target_costs_us is not None or frame_budget_us is not None:
+            limits = Limits.checked(company.n_bots, budgets_us, target_costs_us, frame_budget_us)
+            means = Means.of(self._spending.terms(company.slots_N, limits))
         request = (free_NF.copy(), rewards_N, *limits)
         if retried is not None:
             _check_same(request, retried.request, frame)
             return retried.queries
-        returns_to_go_N = self._contexts.returns_to_go(slots_N) - rewards_N
-        turn = self._ask(handles, slots_N, frame, request, returns_to_go_N.astype(np.float32), limits)
-        self._contexts.spend(slots_N, returns_to_go_N)
-        self._turns.begin(slots_N, turn)
+        returns_to_go_N = self._contexts.returns_to_go(company.batch) - rewards_N
+        turn = self._ask(company, frame, request, returns_to_go_N, means, limits.frame_budget_us)
+        self._contexts.spend(company.batch, returns_to_go_N)
+        company.batch.keep_prepared()
+        self._turns.begin(company, turn)
         return turn.queries
 
     def submit_features(
@@ -154,18 +164,19 @@ class Bots:
         Raises BadShape, BadSchema, NoBot, StaleFrame, NoPendingQuery, UnrequestedFeature, MissingFeature, NonFinite,
         OutOfRange, FrameReused.
         """
-        slots_N = self._slots.resolve(handles)
+        company = self._companies.named(handles, _NOTHING_SAID)
         check_frame(frame)
-        turn = self._turns.features(handles, slots_N, frame)
-        table, query_NM = self.bundle.manifest.features, turn.queries.query_NM
-        acquired_NM, known_ND = inputs.check_features(acquired_NM, costly_ND, failed_NM, query_NM, handles, table)
-        submission = (acquired_NM, known_ND)
+        turn, batch = self._turns.features(company, frame), company.batch
+        staged_ND = batch.costly_ND if turn.actions is None else np.empty_like(batch.costly_ND)
+        query_NM = turn.queries.query_NM
+        known_NM = self._checks.costly(acquired_NM, costly_ND, failed_NM, query_NM, handles, staged_ND)
         if turn.actions is not None:
-            _check_same(submission, turn.submission, frame)
+            _check_same((staged_ND, known_NM), self._contexts.acquired(batch), frame)
             return turn.actions
-        actions = self._act(turn, slots_N, acquired_NM, known_ND)
-        turn.submission, turn.actions = submission, actions
-        return actions
+        np.copyto(batch.query_NM, known_NM)
+        turn.actions = self._act(turn, batch)
+        batch.keep_acquired()
+        return turn.actions
 
     def stop(self, handles: _Handles) -> int:
         """End these bots and zero all that is kept of them; how many. Raises BadShape, BadSchema, NoBot.
@@ -173,6 +184,7 @@ class Bots:
         A query pending for them and for others can no longer be answered; the others go on with their next frame.
         """
         slots_N = self._slots.resolve(handles)
+        self._companies.forget(slots_N)
         self._turns.leave(slots_N)
         self._contexts.clear(slots_N)
         self._spending.clear(slots_N)
@@ -181,58 +193,72 @@ class Bots:
 
     def _ask(
         self,
-        handles: _Handles,
-        slots_N: NDArray[np.int64],
+        company: Company,
         frame: int,
         request: tuple[NDArray[np.generic], ...],
-        returns_to_go_N: NDArray[np.float32],
-        limits: Limits,
+        returns_to_go_N: NDArray[np.float64],
+        means: Means,
+        frame_budget_us: float | None,
     ) -> Turn:
         """Compute a turn's first half without changing any bot."""
-        manifest, free_NF = self.bundle.manifest, request[0].astype(np.float32, copy=False)
-        n_queries, hidden_NW = manifest.features.n_queries, self._contexts.hidden(slots_N)
-        costs_NM, calls_N, budgets_N, target_cost_N = self._spending.terms(slots_N, limits)
+        batch, n_queries = company.batch, self.bundle.manifest.features.n_queries
+        batch.fetch_past()
+        batch.free_NF[...] = request[0]
+        batch.left_N1[:, 0] = returns_to_go_N
+        batch.target_cost_N1[:, 0] = means.terms.target_cost_N
         started_ns = self._clock()
-        probs_NM = self._policy.query_probs(hidden_NW, free_NF, returns_to_go_N, target_cost_N)
+        self._policy.query_probs(batch)
         infer_us = (self._clock() - started_ns) / 1e3
-        asks_N = np.logical_and.reduce(np.isfinite(probs_NM), axis=1)
-        seeds_N, turns_N = self._contexts.seeds(slots_N), self._contexts.turns(slots_N)
-        noise = uniforms(seeds_N, turns_N, n_queries + manifest.action.size)
-        sampled_NM = (noise[:, :n_queries] < probs_NM) & asks_N[:, None]
-        query_NM = allocate(probs_NM, sampled_NM, costs_NM, calls_N, budgets_N, limits.frame_budget_us)
-        cost_us_N = np.where(query_NM, costs_NM, 0.0).sum(axis=1) + np.where(query_NM.any(axis=1), calls_N, 0.0)
+        probs_NM, noise = batch.probs_NM.copy(), self._contexts.noise(batch)
+        query_NM = noise[:, :n_queries] < probs_NM
+        finite_NM, asks_N = np.isfinite(probs_NM), None
+        if np.count_nonzero(finite_NM) < finite_NM.size:
+            asks_N = np.logical_and.reduce(finite_NM, axis=1)
+            query_NM &= asks_N[:, None]
+        cost_us_N = means.cost_us(query_NM)
+        if frame_budget_us is not None or np.count_nonzero(cost_us_N <= means.ample_N) < batch.n_bots:
+            query_NM = allocate(probs_NM, query_NM, *means.terms[:3], frame_budget_us)
+            cost_us_N = means.cost_us(query_NM)
         _freeze(query_NM, cost_us_N, probs_NM)
         queries = Queries(frame, query_NM, cost_us_N, probs_NM, infer_us)
-        return Turn(frame, handles.copy(), request, free_NF, queries, returns_to_go_N, noise[:, n_queries:], ~asks_N)
+        return Turn(frame, company.handles_N, request, queries, noise[:, n_queries:], asks_N)
 
-    def _act(
-        self, turn: Turn, slots_N: NDArray[np.int64], acquired_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]
-    ) -> Actions:
+    def _act(self, turn: Turn, batch: Batch) -> Actions:
         """A turn's second half: act, then advance the contexts of those bots whose step is finite."""
-        contexts = self._contexts
-        cache, ages_NS = contexts.cache(slots_N), contexts.ages(slots_N)
+        batch.fetch_context()
+        if self.bundle.manifest.samples_action:
+            np.copyto(batch.noise_NA, turn.noise_NA)
         started_ns = self._clock()
-        step = self._policy.act(
-            turn.free_NF, costly_ND, acquired_NM, turn.returns_to_go_N, turn.noise_NA, cache, ages_NS
-        )
+        self._policy.act(batch)
         infer_us = (self._clock() - started_ns) / 1e3
-        usable_N = step.finite_N
         # A Gaussian head may overshoot; what leaves is within the action that the bundle declares.
-        learned_NA = np.minimum(np.maximum(step.action_NA, self._low_A), self._high_A)
+        action_NA = np.maximum(batch.action_NA, self._low_A)
+        np.minimum(action_NA, self._high_A, out=action_NA)
+        if batch.is_finite and turn.asks_N is None:
+            reasons_N = np.zeros(batch.n_bots, dtype=np.uint8)  # all learned
+            self._contexts.advance(batch, action_NA)
+            self.counters.count_learned(batch.n_bots)
+        else:
+            action_NA, reasons_N = self._fall_back(turn, batch, action_NA)
+            self.counters.count(reasons_N)
+        _freeze(action_NA, reasons_N)
+        return Actions(turn.frame, action_NA, reasons_N, infer_us)
+
+    def _fall_back(
+        self, turn: Turn, batch: Batch, learned_NA: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """The actions and their reasons where not everything was finite; only contexts whose step was are advanced."""
+        contexts, usable_N = self._contexts, batch.finite_N
         action_NA, reasons_N = fallback_actions(
             learned_NA,
             usable_N,
-            turn.no_query_N,
-            contexts.last_action(slots_N),
-            contexts.turns(slots_N) > 0,
+            np.zeros(batch.n_bots, dtype=np.bool_) if turn.asks_N is None else ~turn.asks_N,
+            contexts.last_action(batch),
+            contexts.turns(batch) > 0,
             self.bundle.manifest.action.safe,
         )
-        kept = slice(None) if usable_N.all() else usable_N
-        taken = Step(action_NA[kept], step.hidden_NW[kept], step.new_keys[:, kept], step.new_values[:, kept])
-        contexts.advance(slots_N[kept], taken)
-        self.counters.count(reasons_N)
-        _freeze(action_NA, reasons_N)
-        return Actions(turn.frame, action_NA, reasons_N, infer_us)
+        contexts.advance(batch, action_NA, usable_N)
+        return action_NA, reasons_N
 
 
 def _check_same(content: tuple[NDArray[np.generic], ...], kept: tuple[NDArray[np.generic], ...], frame: int) -> None:

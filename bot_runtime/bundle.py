@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from bot_runtime.golden import read_golden, replay
 from bot_runtime.graph import check_graph
-from bot_runtime.manifest import FILES, FileEntry, Manifest
-from bot_runtime.policy import Cache, Policy
+from bot_runtime.manifest import FILES, SCHEMA_VERSION, FileEntry, Manifest
+from bot_runtime.policy import Policy
 from protocol.errors import BadBundle
 
 __all__ = ["MANIFEST_FILE", "MAX_FILE_BYTES", "MAX_MANIFEST_BYTES", "MAX_TURN_MS", "Bundle"]
@@ -33,6 +32,12 @@ MAX_FILE_BYTES = 256 * 2**20
 MAX_TURN_MS = 100.0  # a frame is 16: what takes longer than this, at its fastest, can serve nobody
 _PROBE_BOTS = 3
 _PROBE_TURNS = 5  # a busy machine may stretch some of them
+
+
+class _Version(msgspec.Struct):
+    """What every schema of a manifest has."""
+
+    schema_version: int
 
 
 @dataclass(frozen=True)
@@ -67,8 +72,13 @@ class Bundle:
 
 
 def _read_manifest(path: Path) -> Manifest:
+    content = _read(path, MAX_MANIFEST_BYTES)
     try:
-        return msgspec.json.decode(_read(path, MAX_MANIFEST_BYTES), type=Manifest)
+        version = msgspec.json.decode(content, type=_Version).schema_version
+        if version != SCHEMA_VERSION:
+            expected = f"expected {SCHEMA_VERSION}: export the run again"
+            raise BadBundle(f"{path.name} has schema_version {version}, {expected}")
+        return msgspec.json.decode(content, type=Manifest)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise BadBundle(f"{path.name}: {error}") from error
 
@@ -117,33 +127,8 @@ def _verify_behaviour(bundle: Bundle, golden: bytes, *, with_replay: bool, clock
 def _probe_latency(policy: Policy, manifest: Manifest, clock: Callable[[], int]) -> None:
     for _ in range(_PROBE_TURNS):
         started_ns = clock()
-        _probe_batch(policy, manifest)
+        policy.check_batch(_PROBE_BOTS)
         turn_ms = (clock() - started_ns) / 1e6
         if turn_ms <= MAX_TURN_MS:
             return
     raise BadBundle(f"a turn of {manifest.name} takes {turn_ms:.0f} ms, expected at most {MAX_TURN_MS:g}")
-
-
-def _probe_batch(policy: Policy, manifest: Manifest) -> None:
-    """Run several bots at once: the golden episode has one, and exporters like to freeze a batch of one."""
-    table, n_bots = manifest.features, _PROBE_BOTS
-    zeros = {n: np.zeros((n_bots, n), dtype=np.float32) for n in (table.n_free, table.n_costly, manifest.action.size)}
-    returns_to_go_N = np.full(n_bots, manifest.target_return, dtype=np.float32)
-    hidden_NW = np.zeros((n_bots, manifest.width), dtype=np.float32)
-    probs_NM = policy.query_probs(hidden_NW, zeros[table.n_free], returns_to_go_N, np.zeros(n_bots, dtype=np.float32))
-    head = (manifest.n_layers, n_bots, manifest.n_heads)
-    empty = np.zeros((*head, manifest.n_slots, manifest.head_dim), dtype=np.float32)
-    step = policy.act(
-        zeros[table.n_free],
-        zeros[table.n_costly],
-        np.zeros((n_bots, table.n_queries), dtype=np.bool_),
-        returns_to_go_N,
-        zeros[manifest.action.size],
-        Cache(empty, empty),
-        np.full((n_bots, manifest.n_slots), manifest.context_length, dtype=np.int64),
-    )
-    token = (*head, manifest.head_dim)
-    expected = [(n_bots, table.n_queries), (n_bots, manifest.action.size), (n_bots, manifest.width), token, token]
-    for name, array, shape in zip(("query_probs", *step._fields), (probs_NM, *step), expected, strict=True):
-        if array.shape != shape:
-            raise BadBundle(f"{name} of {n_bots} bots has shape {list(array.shape)}, expected {list(shape)}")

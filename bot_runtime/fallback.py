@@ -35,6 +35,10 @@ class Counters:
         """Add one turn a bot."""
         self._reasons += np.bincount(reasons_N, minlength=len(Reason))
 
+    def count_learned(self, n_bots: int) -> None:
+        """Add one turn a bot, all of them learned."""
+        self._reasons[Reason.LEARNED] += n_bots
+
     @property
     def reasons(self) -> dict[Reason, int]:
         """Turns so far by reason, one a bot."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from bot_runtime.context import Contexts
 from bot_runtime.manifest import Manifest
-from bot_runtime.noise import uniforms
 from bot_runtime.policy import Policy
 from protocol.errors import BadBundle
 
@@ -63,28 +62,24 @@ def replay(policy: Policy, manifest: Manifest, golden: Golden) -> None:
     """
     contexts = Contexts(manifest, 1)
     contexts.begin(_ONE_BOT, golden["seed"].astype(np.uint64).reshape(1), np.zeros(1))
+    batch = contexts.batch(_ONE_BOT)
     returns_to_go_T = golden["target_return"].astype(np.float64) - np.cumsum(golden["rewards"].astype(np.float64))
-    free_TF, costly_TD = golden["free"].astype(np.float32), golden["costly"].astype(np.float32)
-    query_TM = golden["queries"].astype(np.bool_)
-    costly_TD = np.where(query_TM[:, manifest.features.owner], costly_TD, np.float32(0.0))
-    target_cost_N = golden.get("target_cost", np.float32(0.0)).astype(np.float32).reshape(1)
-    for turn in range(len(free_TF)):
-        row = slice(turn, turn + 1)
-        returns_to_go_N = returns_to_go_T[row].astype(np.float32)
-        probs_NM = policy.query_probs(contexts.hidden(_ONE_BOT), free_TF[row], returns_to_go_N, target_cost_N)
-        noise_NA = _action_noise(contexts, manifest)
-        cache, ages_NS = contexts.cache(_ONE_BOT), contexts.ages(_ONE_BOT)
-        step = policy.act(free_TF[row], costly_TD[row], query_TM[row], returns_to_go_N, noise_NA, cache, ages_NS)
-        for name, got in (("probs", probs_NM), ("actions", step.action_NA), ("hidden", step.hidden_NW)):
-            if name in golden:
-                _compare(name, turn, got[0], golden[name][turn], manifest.tolerance)
-        contexts.advance(_ONE_BOT, step)
-
-
-def _action_noise(contexts: Contexts, manifest: Manifest) -> NDArray[np.float32]:
-    n_queries, n_actions = manifest.features.n_queries, manifest.action.size
-    seeds_N, turns_N = contexts.seeds(_ONE_BOT), contexts.turns(_ONE_BOT)
-    return uniforms(seeds_N, turns_N, n_queries + n_actions)[:, n_queries:]
+    query_TM, n_queries = golden["queries"].astype(np.bool_), manifest.features.n_queries
+    costly_TD = np.where(query_TM[:, manifest.features.owner], golden["costly"], 0.0)
+    batch.target_cost_N1[:] = golden.get("target_cost", 0.0)
+    for turn in range(len(query_TM)):
+        batch.free_NF[:], batch.left_N1[:] = golden["free"][turn], returns_to_go_T[turn]
+        policy.query_probs(batch)
+        _compare("probs", turn, batch.probs_NM[0], golden["probs"][turn], manifest.tolerance)
+        batch.keep_prepared()
+        batch.costly_ND[:], batch.query_NM[:] = costly_TD[turn], query_TM[turn]
+        if manifest.samples_action:
+            batch.noise_NA[:] = contexts.noise(batch)[:, n_queries:]
+        policy.act(batch)
+        _compare("actions", turn, batch.action_NA[0], golden["actions"][turn], manifest.tolerance)
+        if manifest.has_context:
+            _compare("hidden", turn, batch.hidden_NW[0], golden["hidden"][turn], manifest.tolerance)
+        contexts.advance(batch, batch.action_NA)
 
 
 def _compare(name: str, turn: int, got: NDArray[np.generic], recorded: NDArray[np.generic], tolerance: float) -> None:

@@ -6,6 +6,7 @@ its request is refused with the bot, the feature, what was expected and what cam
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ from protocol.errors import BadShape, MissingFeature, NonFinite, OutOfRange, Unr
 from protocol.features import CostModel, Feature, FeatureTable
 from protocol.values import check_shape, check_values
 
-__all__ = ["check_costs", "check_features", "check_free", "per_bot", "seeds"]
+__all__ = ["FeatureChecks", "check_costs", "per_bot", "seeds"]
 
 _MAX_SEED = 2**64 - 1
 
@@ -57,36 +58,62 @@ def seeds(numbers: Sequence[int] | NDArray[np.integer], n_bots: int) -> NDArray[
     return np.array([int(seed) for seed in numbers], dtype=np.uint64)
 
 
-def check_free(free_NF: _Floats, handles_N: NDArray[np.int64], table: FeatureTable) -> None:
-    """Raises BadShape, NonFinite or OutOfRange unless these are legal free numbers of these bots."""
-    check_shape("free", free_NF, (handles_N.size, table.n_free), np.float32)
-    check_values(free_NF, None, handles_N, table.free, table.free_range)
+class FeatureChecks:
+    """The checks of one feature table for up to `capacity` bots, with room for what they compute on the way."""
 
+    def __init__(self, table: FeatureTable, capacity: int) -> None:
+        self._table = table
+        self._free_range, self._costly_range, self._owner = table.free_range, table.costly_range, table.owner
+        low, high = self._costly_range
+        self._zero_is_legal = bool((low <= 0.0).all() and (high >= 0.0).all())
+        shape = (capacity, max(table.n_free, table.n_costly))
+        self._legal, self._low_enough = np.empty((2, math.prod(shape)), dtype=np.bool_)
+        self._known = np.empty((capacity, table.n_costly), dtype=np.bool_)
 
-def check_features(
-    acquired_NM: _Bools,
-    costly_ND: _Floats,
-    failed_NM: _Bools | None,
-    query_NM: _Bools,
-    handles_N: NDArray[np.int64],
-    table: FeatureTable,
-) -> tuple[_Bools, _Floats]:
-    """What was really acquired [N, M] (a failed feature was not), and its values [N, D], zero where not acquired.
+    def free(self, free_NF: _Floats, handles_N: NDArray[np.int64]) -> None:
+        """Raises BadShape, NonFinite or OutOfRange unless these are legal free numbers of these bots."""
+        check_shape("free", free_NF, (handles_N.size, self._table.n_free), np.float32)
+        if not self._within(free_NF, self._free_range):
+            check_values(free_NF, None, handles_N, self._table.free, self._free_range)
 
-    Raises BadShape; UnrequestedFeature for anything beyond the query; MissingFeature where the query is not covered;
-    NonFinite and OutOfRange for acquired values. Other values are never looked at.
-    """
-    bits, numbers = (handles_N.size, table.n_queries), (handles_N.size, table.n_costly)
-    check_shape("acquired", acquired_NM, bits, np.bool_)
-    check_shape("values", costly_ND, numbers, np.float32)
-    answered_NM, known_NM = acquired_NM, query_NM
-    if failed_NM is not None:
-        check_shape("failed", failed_NM, bits, np.bool_)
-        answered_NM, known_NM = acquired_NM | failed_NM, query_NM & ~failed_NM
-    _check_answered(answered_NM, query_NM, handles_N, table.costly)
-    known_ND = known_NM[:, table.owner]
-    check_values(costly_ND, known_ND, handles_N, table.costly, table.costly_range)
-    return known_NM, np.where(known_ND, costly_ND, np.float32(0.0))
+    def costly(
+        self,
+        acquired_NM: _Bools,
+        costly_ND: _Floats,
+        failed_NM: _Bools | None,
+        query_NM: _Bools,
+        handles_N: NDArray[np.int64],
+        out_ND: _Floats,
+    ) -> _Bools:
+        """What was really acquired [N, M] (a failed feature was not); its values go to `out_ND`, zero where not
+        acquired.
+
+        Raises BadShape; UnrequestedFeature for anything beyond the query; MissingFeature where the query is not
+        covered; NonFinite and OutOfRange for acquired values. Other values are never looked at.
+        """
+        table, n_bots = self._table, handles_N.size
+        check_shape("acquired", acquired_NM, (n_bots, table.n_queries), np.bool_)
+        check_shape("values", costly_ND, (n_bots, table.n_costly), np.float32)
+        known_NM = query_NM
+        if failed_NM is not None:
+            check_shape("failed", failed_NM, (n_bots, table.n_queries), np.bool_)
+            known_NM = query_NM & ~failed_NM
+            _check_answered(acquired_NM | failed_NM, query_NM, handles_N, table.costly)
+        elif acquired_NM.tobytes() != query_NM.tobytes():
+            _check_answered(acquired_NM, query_NM, handles_N, table.costly)
+        known_ND = known_NM.take(self._owner, axis=1, out=self._known[:n_bots], mode="clip")
+        out_ND.fill(0.0)
+        np.copyto(out_ND, costly_ND, where=known_ND)
+        if not (self._zero_is_legal and self._within(out_ND, self._costly_range)):
+            check_values(costly_ND, known_ND, handles_N, table.costly, self._costly_range)
+        return known_NM
+
+    def _within(self, numbers: _Floats, limits: tuple[_Floats, _Floats]) -> bool:
+        """Whether all are; not where one is NaN."""
+        legal, low_enough = (room[: numbers.size].reshape(numbers.shape) for room in (self._legal, self._low_enough))
+        np.greater_equal(numbers, limits[0], out=legal)
+        np.less_equal(numbers, limits[1], out=low_enough)
+        return int(np.count_nonzero(np.logical_and(legal, low_enough, out=legal))) == numbers.size
 
 
 def _check_answered(

@@ -15,7 +15,7 @@ from protocol.features import ActionSpec, FeatureTable
 
 __all__ = ["FILES", "MAX_CONTEXT_LENGTH", "MAX_TOLERANCE", "SCHEMA_VERSION", "FileEntry", "Manifest"]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 FILES = ("acquisition.onnx", "action.onnx", "golden.npz")
 MAX_CONTEXT_LENGTH = 1024
 MAX_TOLERANCE = 1e-2
@@ -39,15 +39,16 @@ class FileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Schema 1 of `manifest.json`. Raises ValueError (msgspec turns it into ValidationError) when a field is illegal.
+    """Schema 2 of `manifest.json`. Raises ValueError (msgspec turns it into ValidationError) when a field is illegal.
 
     `budget` is the normalised C of the paper, in [0, 1]; 1 means unconstrained. `context_length` 1 means no context at
-    all: a network without memory, whose layers, heads and width are 0. `target_cost` is the share of the full cost
-    that a budget-conditioned network is asked for by default; None, and the network has no such input. `tolerance` is
-    the largest |Δ| that the golden replay accepts.
+    all: a network without memory, whose layers, heads and width are 0. `prepared_width` is how many numbers the
+    acquisition graph hands on to the action graph, `samples_action` says that the latter reads noise. `target_cost` is
+    the share of the full cost that a budget-conditioned network is asked for by default; None, and the network has no
+    such input. `tolerance` is the largest |Δ| that the golden replay accepts.
     """
 
-    schema_version: Literal[1]
+    schema_version: Literal[2]
     name: str
     method: Literal["bdt", "rcbc", "bc", "iql"]
     features: FeatureTable
@@ -57,6 +58,8 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     n_heads: int
     head_dim: int
     width: int
+    prepared_width: int
+    samples_action: bool
     target_return: float
     budget: float
     tolerance: float
@@ -87,6 +90,8 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if not low <= getattr(self, field) <= high:
                 expected = f"{low} to {high} with context_length {self.context_length}"
                 raise ValueError(f"{field} is {getattr(self, field)}, expected {expected}")
+        if not 1 <= self.prepared_width <= _MAX_DIMENSION:
+            raise ValueError(f"prepared_width is {self.prepared_width}, expected 1 to {_MAX_DIMENSION}")
         if 2 * self.n_layers * self.n_heads * self.n_slots * self.head_dim > _MAX_CONTEXT_NUMBERS:
             raise ValueError(f"one bot's keys and values are more than {_MAX_CONTEXT_NUMBERS} numbers")
 

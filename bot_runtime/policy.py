@@ -1,55 +1,32 @@
 """The two ONNX graphs of a bundle behind two calls.
 
-This module knows nothing about files, bots, turns or budgets: arrays in, arrays out, one row a bot. L layers, H heads,
-S cached turns, d numbers a head, W numbers of hidden state.
+This module knows nothing about files, bots, turns or budgets. A batch's arrays are bound once to each graph, so that a
+call copies nothing and makes nothing. L layers, H heads, S cached turns, d numbers a head, W numbers of hidden state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from bot_runtime.batch import Batch
 from protocol.errors import BadBundle
 
 if TYPE_CHECKING:  # a bundle is verified by running its policy, so the import cannot go both ways at run time
     from bot_runtime.bundle import Bundle
     from bot_runtime.manifest import Manifest
 
-__all__ = ["Cache", "Policy", "Step"]
+__all__ = ["Policy"]
 
-Floats = NDArray[np.float32]
 _FATAL_ONLY = 4
+_FLOAT = "tensor(float)"
 _Port = tuple[str, tuple[int | None, ...]]  # ONNX element type and shape, None where the axis is the batch
-
-
-class Cache(NamedTuple):
-    """Keys and values of the last S turns, each [L, N, H, S, d]."""
-
-    keys: Floats
-    values: Floats
-
-
-class Step(NamedTuple):
-    """What one turn computed: action [N, A], hidden [N, W], and the turn's own keys and values, each [L, N, H, d].
-
-    Without a context W, L, H and d are 0: there is nothing but the action.
-    """
-
-    action_NA: Floats
-    hidden_NW: Floats
-    new_keys: Floats
-    new_values: Floats
-
-    @property
-    def finite_N(self) -> NDArray[np.bool_]:
-        """Which bots' numbers are all finite, shape [N]: one NaN in a cache would spoil a bot for good."""
-        tokens = np.isfinite(self.new_keys) & np.isfinite(self.new_values)  # [L, N, H, d]
-        outputs = np.isfinite(self.action_NA).all(axis=1) & np.isfinite(self.hidden_NW).all(axis=1)
-        return np.logical_and(outputs, tokens.all(axis=(0, 2, 3)))
+_Ports = dict[str, _Port]
+_Arrays = dict[str, NDArray[Any]]
 
 
 class Policy:
@@ -60,61 +37,89 @@ class Policy:
     """
 
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
+        self._manifest = bundle.manifest
         self._acquisition = _session("acquisition.onnx", bundle.acquisition, threads)
         self._action = _session("action.onnx", bundle.action, threads)
-        self._has_context, self._is_conditioned = bundle.manifest.has_context, bundle.manifest.is_conditioned
-        inputs, outputs = _acquisition_ports(bundle.manifest)
-        _check_ports("acquisition.onnx", self._acquisition, inputs, outputs)
-        inputs, outputs = _action_ports(bundle.manifest)
-        _check_ports("action.onnx", self._action, inputs, outputs)
+        _check_ports("acquisition.onnx", self._acquisition, *_acquisition_ports(bundle.manifest))
+        _check_ports("action.onnx", self._action, *_action_ports(bundle.manifest))
 
-    def query_probs(self, hidden_NW: Floats, free_NF: Floats, returns_to_go_N: Floats, target_cost_N: Floats) -> Floats:
-        """Bernoulli means of each bot's query, shape [N, M] (π̂ of the paper, reading the state after the last turn).
+    def query_probs(self, batch: Batch) -> None:
+        """Bernoulli means of each bot's query (π̂ of the paper, reading the state after the last turn), and what the
+        action graph needs of what is known before it: from `before_NX` and `target_cost_N1` to `probs_NM`, `asked_NE`.
 
-        `target_cost_N` are shares of each bot's full cost in [0, 1], of no effect unless the network is conditioned on
-        them; `hidden_NW` has no columns where the network has no context.
+        Target costs are shares of each bot's full cost in [0, 1], of no effect unless the network is conditioned on
+        them.
         """
-        feed = {"free": free_NF, "returns_to_go": returns_to_go_N[:, None]}
-        if self._has_context:
-            feed["hidden"] = hidden_NW
-        if self._is_conditioned:
-            feed["target_cost"] = target_cost_N[:, None]
-        probs_NM: Floats = self._acquisition.run(["query_probs"], _float32(feed))[0]
-        return probs_NM
+        run = batch.runs.get("acquisition")
+        if run is None:
+            run = batch.runs["acquisition"] = _bound(self._acquisition, *_acquisition_arrays(self._manifest, batch))
+        run()
 
-    def act(
-        self,
-        free_NF: Floats,
-        costly_ND: Floats,
-        query_NM: NDArray[np.bool_],
-        returns_to_go_N: Floats,
-        noise_NA: Floats,
-        cache: Cache,
-        ages_NS: NDArray[np.int64],
-    ) -> Step:
-        """One incremental trunk step for every bot (π̃ of the paper).
+    def act(self, batch: Batch) -> None:
+        """One incremental trunk step for every bot (π̃ of the paper), to `action_NA`, `hidden_NW` and `tokens`.
 
-        `costly_ND` is zero where not acquired, `query_NM` is what was acquired, `noise_NA` is uniform in [0, 1). A
-        network without a context reads neither `cache` nor `ages_NS`.
+        Reads `prepared_NE`, `acquired_NY` (costly numbers, zero where not acquired, and what was acquired), the context
+        and, where a component of the action is sampled, `noise_NA`, uniform in [0, 1).
         """
-        feed = {
-            "free": free_NF,
-            "costly": costly_ND,
-            "query": query_NM,
-            "returns_to_go": returns_to_go_N[:, None],
-            "noise": noise_NA,
-        }
-        if not self._has_context:
-            (action_NA,) = self._action.run(["action"], _float32(feed))
-            nothing = np.zeros((0, len(action_NA), 0, 0), dtype=np.float32)
-            return Step(action_NA, np.zeros((len(action_NA), 0), dtype=np.float32), nothing, nothing)
-        arrays = _float32(feed | cache._asdict())
-        arrays["ages"] = np.ascontiguousarray(ages_NS, dtype=np.int64)
-        return Step(*self._action.run(["action", "hidden", "new_keys", "new_values"], arrays))
+        run = batch.runs.get("action")
+        if run is None:
+            run = batch.runs["action"] = _bound(self._action, *_action_arrays(self._manifest, batch))
+        run()
+
+    def check_batch(self, n_bots: int) -> None:
+        """Run both graphs on zeros. Raises BadBundle where an output is not of the manifest's shape for so many bots.
+
+        A golden episode has one bot, and exporters like to freeze a batch of one.
+        """
+        for session, (inputs, outputs) in (
+            (self._acquisition, _acquisition_ports(self._manifest)),
+            (self._action, _action_ports(self._manifest)),
+        ):
+            feed = {
+                name: np.zeros(_sized(shape, n_bots), np.float32 if element == _FLOAT else np.int64)
+                for name, (element, shape) in inputs.items()
+            }
+            for name, array in zip(outputs, session.run(list(outputs), feed), strict=True):
+                expected = _sized(outputs[name][1], n_bots)
+                if array.shape != expected:
+                    found = f"{name} of {n_bots} bots has shape {list(array.shape)}"
+                    raise BadBundle(f"{found}, expected {list(expected)}")
 
 
-def _float32(feed: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
-    return {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in feed.items()}
+def _bound(session: ort.InferenceSession, inputs: _Arrays, outputs: _Arrays) -> Callable[[], Any]:
+    """A call that runs the session on these arrays as they then are, which it keeps alive."""
+    binding = session.io_binding()
+    for name, array in inputs.items():
+        binding.bind_input(name, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
+    for name, array in outputs.items():
+        binding.bind_output(name, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
+    arrays = (inputs, outputs)
+
+    def run(_: object = arrays) -> None:
+        session.run_with_iobinding(binding)
+
+    return run
+
+
+def _acquisition_arrays(manifest: Manifest, batch: Batch) -> tuple[_Arrays, _Arrays]:
+    inputs = {"before": batch.before_NX}
+    if manifest.is_conditioned:
+        inputs["target_cost"] = batch.target_cost_N1
+    return inputs, {"query_probs": batch.probs_NM, "prepared": batch.asked_NE}
+
+
+def _action_arrays(manifest: Manifest, batch: Batch) -> tuple[_Arrays, _Arrays]:
+    inputs: _Arrays = {"prepared": batch.prepared_NE, "acquired": batch.acquired_NY}
+    outputs: _Arrays = {"action": batch.action_NA}
+    if manifest.samples_action:
+        inputs["noise"] = batch.noise_NA
+    if manifest.has_context:
+        inputs["place"], outputs["hidden"] = batch.place_N, batch.hidden_NW
+    for layer in range(manifest.n_layers):
+        for kind, name in enumerate(("key", "value")):
+            inputs[f"{name}s_{layer}"] = batch.memory[layer, kind][:, None]
+            outputs[f"{name}_{layer}"] = batch.tokens[layer, kind][:, None, :, None]
+    return inputs, outputs
 
 
 def _session(file: str, graph: bytes, threads: int) -> ort.InferenceSession:
@@ -133,40 +138,41 @@ def _session(file: str, graph: bytes, threads: int) -> ort.InferenceSession:
         raise BadBundle(f"{file} does not load in onnxruntime: {str(error)[:300]}") from error
 
 
-def _acquisition_ports(manifest: Manifest) -> tuple[dict[str, _Port], dict[str, _Port]]:
+def _acquisition_ports(manifest: Manifest) -> tuple[_Ports, _Ports]:
     table = manifest.features
-    inputs = {"free": _floats(table.n_free), "returns_to_go": _floats(1)}
-    if manifest.has_context:
-        inputs["hidden"] = _floats(manifest.width)
+    inputs = {"before": _floats(manifest.width + table.n_free + 1)}
     if manifest.is_conditioned:
         inputs["target_cost"] = _floats(1)
-    return inputs, {"query_probs": _floats(table.n_queries)}
+    return inputs, {"query_probs": _floats(table.n_queries), "prepared": _floats(manifest.prepared_width)}
 
 
-def _action_ports(manifest: Manifest) -> tuple[dict[str, _Port], dict[str, _Port]]:
-    table = manifest.features
-    inputs: dict[str, _Port] = {
-        "free": _floats(table.n_free),
-        "costly": _floats(table.n_costly),
-        "query": _floats(table.n_queries),
-        "returns_to_go": _floats(1),
-        "noise": _floats(manifest.action.size),
+def _action_ports(manifest: Manifest) -> tuple[_Ports, _Ports]:
+    table, heads, slots, dim = manifest.features, manifest.n_heads, manifest.n_slots, manifest.head_dim
+    inputs = {
+        "prepared": _floats(manifest.prepared_width),
+        "acquired": _floats(table.n_costly + table.n_queries),
     }
-    outputs: dict[str, _Port] = {"action": _floats(manifest.action.size)}
+    outputs = {"action": _floats(manifest.action.size)}
+    if manifest.samples_action:
+        inputs["noise"] = _floats(manifest.action.size)
     if manifest.has_context:
-        layers, heads, slots, dim = manifest.n_layers, manifest.n_heads, manifest.n_slots, manifest.head_dim
-        cache: _Port = ("tensor(float)", (layers, None, heads, slots, dim))
-        token: _Port = ("tensor(float)", (layers, None, heads, dim))
-        inputs |= {"keys": cache, "values": cache, "ages": ("tensor(int64)", (None, slots))}
-        outputs |= {"hidden": _floats(manifest.width), "new_keys": token, "new_values": token}
+        inputs["place"], outputs["hidden"] = ("tensor(int64)", (None,)), _floats(manifest.width)
+    for layer in range(manifest.n_layers):
+        for name in ("key", "value"):
+            inputs[f"{name}s_{layer}"] = _floats(1, heads, slots, dim)
+            outputs[f"{name}_{layer}"] = _floats(1, heads, 1, dim)
     return inputs, outputs
 
 
-def _floats(columns: int) -> _Port:
-    return "tensor(float)", (None, columns)
+def _floats(*shape: int) -> _Port:
+    return _FLOAT, (None, *shape)
 
 
-def _check_ports(file: str, session: ort.InferenceSession, inputs: dict[str, _Port], outputs: dict[str, _Port]) -> None:
+def _sized(shape: tuple[int | None, ...], n_bots: int) -> tuple[int, ...]:
+    return tuple(n_bots if size is None else size for size in shape)
+
+
+def _check_ports(file: str, session: ort.InferenceSession, inputs: _Ports, outputs: _Ports) -> None:
     for kind, ports, expected in (
         ("input", session.get_inputs(), inputs),
         ("output", session.get_outputs(), outputs),

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bot_runtime.company import Company
 from bot_runtime.fallback import Counters
 from protocol.errors import FrameReused, NoPendingQuery
 from protocol.turn import Event, Phase, is_retry, transition
@@ -48,13 +49,12 @@ class Turn:
     frame: int
     handles_N: _Ints
     request: tuple[NDArray[np.generic], ...]  # what a retry must equal
-    free_NF: NDArray[np.float32]
     queries: Queries
-    returns_to_go_N: NDArray[np.float32]
     noise_NA: NDArray[np.float32]
-    no_query_N: NDArray[np.bool_]
-    submission: tuple[NDArray[np.generic], ...] = ()
+    asks_N: NDArray[np.bool_] | None  # whose query_probs were finite; None: everyone's
     actions: Actions | None = None
+    key: int = _NONE  # in `Turns`
+    members: int = 0  # how many of its bots have begun no other turn since, and are still there
 
     @property
     def phase(self) -> Phase:
@@ -68,50 +68,55 @@ class Turns:
     def __init__(self, capacity: int, counters: Counters) -> None:
         self._turn_of_B = np.full(capacity, _NONE, dtype=np.int64)
         self._turns: dict[int, Turn] = {}
-        self._members: dict[int, int] = {}
-        self._next_id = _NONE + 1
+        self._next_key = _NONE + 1
         self._counters = counters
 
-    def query(self, handles_N: _Ints, slots_N: _Ints, frame: int) -> Turn | None:
+    def query(self, company: Company, frame: int) -> Turn | None:
         """The turn that this request repeats, or None when it is a new one; changes nothing.
 
         Raises StaleFrame; FrameReused when any of these bots saw this frame in other company.
         """
-        repeats = False
-        for turn in self._distinct(slots_N):
+        repeats, turns = False, self._last(company)
+        for turn in turns:
             phase, last_frame = (turn.phase, turn.frame) if turn else (Phase.IDLE, None)
             transition(phase, last_frame, Event.QUERY, frame)
             repeats |= is_retry(phase, last_frame, Event.QUERY, frame)
         if not repeats:
             return None
-        turn = self._turns.get(int(self._turn_of_B[slots_N[0]]))
-        if turn is None or not np.array_equal(turn.handles_N, handles_N):
+        turn = self._turns.get(int(self._turn_of_B[company.slots_N[0]]))
+        if turn is None or not _are_its_bots(company, turn):
             raise FrameReused(f"frame {frame} was requested before with other bots, or in another order")
         return turn
 
-    def features(self, handles_N: _Ints, slots_N: _Ints, frame: int) -> Turn:
+    def features(self, company: Company, frame: int) -> Turn:
         """The turn that these features answer (again, if its actions are known); changes nothing.
 
         Raises StaleFrame and NoPendingQuery, the latter also unless the bots are exactly the query's, in its order.
         """
-        turns = self._distinct(slots_N)
+        turns = self._last(company)
         for turn in turns:
             phase, last_frame = (turn.phase, turn.frame) if turn else (Phase.IDLE, None)
             transition(phase, last_frame, Event.FEATURES, frame)
         turn = turns[0]
-        if turn is None or len(turns) > 1 or not np.array_equal(turn.handles_N, handles_N):
+        if turn is None or len(turns) > 1 or not _are_its_bots(company, turn):
             raise NoPendingQuery(f"no query of frame {frame} is pending for exactly these bots in this order")
         return turn
 
-    def begin(self, slots_N: _Ints, turn: Turn) -> None:
-        """Make `turn` the last one of these slots; their pending queries are abandoned."""
-        for old, n_bots in self._leave(slots_N):
+    def begin(self, company: Company, turn: Turn) -> None:
+        """Make `turn` the last one of these bots; their pending queries are abandoned."""
+        shared = _shared(company)
+        if shared is not None:
+            left = [(shared, company.n_bots)]
+            turn.key = shared.key
+        else:
+            left = self._leave(company.slots_N)
+            turn.key, self._next_key = self._next_key, self._next_key + 1
+            self._turn_of_B[company.slots_N] = turn.key
+        for old, n_bots in left:
             self._counters.skipped_frames += n_bots * (turn.frame - old.frame - 1)
             self._counters.abandoned_queries += n_bots if old.phase is Phase.PENDING else 0
-        self._turn_of_B[slots_N] = self._next_id
-        self._turns[self._next_id] = turn
-        self._members[self._next_id] = slots_N.size
-        self._next_id += 1
+        self._turns[turn.key] = company.turn = turn
+        turn.members = company.n_bots
 
     def leave(self, slots_N: _Ints) -> None:
         """Forget the last turn of these slots."""
@@ -121,20 +126,37 @@ class Turns:
         left: list[tuple[Turn, int]] = []
         ids_N = self._turn_of_B[slots_N]
         self._turn_of_B[slots_N] = _NONE
-        for key in _distinct_ids(ids_N):
+        for key in _distinct(ids_N):
             if key != _NONE:
                 count = int(np.count_nonzero(ids_N == key))
-                left.append((self._turns[key], count))
-                self._members[key] -= count
-                if self._members[key] == 0:
-                    del self._members[key], self._turns[key]
+                turn = self._turns[key]
+                left.append((turn, count))
+                turn.members -= count
+                if turn.members == 0:
+                    del self._turns[key]
         return left
 
-    def _distinct(self, slots_N: _Ints) -> list[Turn | None]:
-        return [self._turns.get(key) for key in _distinct_ids(self._turn_of_B[slots_N])]
+    def _last(self, company: Company) -> list[Turn | None]:
+        """The last turns of these bots, each once."""
+        shared = _shared(company)
+        return (
+            [shared]
+            if shared is not None
+            else [self._turns.get(key) for key in _distinct(self._turn_of_B[company.slots_N])]
+        )
 
 
-def _distinct_ids(ids_N: _Ints) -> list[int]:
-    same = bool((ids_N == ids_N[0]).all())
-    ids: list[int] = (ids_N[:1] if same else np.unique(ids_N)).tolist()
-    return ids
+def _shared(company: Company) -> Turn | None:
+    """The turn that these bots began together, where it is still the last one of them all."""
+    turn = company.turn
+    return turn if turn is not None and turn.members == company.n_bots else None
+
+
+def _are_its_bots(company: Company, turn: Turn) -> bool:
+    return turn.handles_N is company.handles_N or np.array_equal(turn.handles_N, company.handles_N)
+
+
+def _distinct(keys_N: _Ints) -> list[int]:
+    same = bool((keys_N == keys_N[0]).all())
+    keys: list[int] = (keys_N[:1] if same else np.unique(keys_N)).tolist()
+    return keys

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import onnxruntime as ort
 
-from bot_runtime.manifest import FILES, FileEntry, Manifest
+from bot_runtime.manifest import FILES, SCHEMA_VERSION, FileEntry, Manifest
 from bot_runtime.noise import uniforms
 from protocol.features import ActionComponent, ActionSpec, Feature, FeatureTable
 from tests.graphs import acquisition_graph, action_graph
@@ -50,6 +50,8 @@ def make_bundle(
     target_return: float = 10.0,
     method: str = "bdt",
     target_cost: float | None = None,
+    prepared_width: int = 6,
+    samples_action: bool = True,
 ) -> Path:
     """Write a bundle into directory `path` (made if missing) and return it. The width is n_heads * head_dim.
 
@@ -60,7 +62,7 @@ def make_bundle(
         n_layers = n_heads = head_dim = 0
     path.mkdir(parents=True, exist_ok=True)
     manifest = Manifest(
-        schema_version=1,
+        schema_version=SCHEMA_VERSION,
         name=name,
         method=method,
         features=features or FEATURES,
@@ -70,6 +72,8 @@ def make_bundle(
         n_heads=n_heads,
         head_dim=head_dim,
         width=n_heads * head_dim,
+        prepared_width=prepared_width,
+        samples_action=samples_action,
         target_return=target_return,
         budget=budget,
         tolerance=1e-4,
@@ -96,7 +100,7 @@ def rehash(path: Path) -> Path:
 
 def _golden(path: Path, manifest: Manifest, seed: int) -> dict[str, np.ndarray]:
     """Record an episode with plain sessions and a cache kept as a list: no ring, no arena, no Policy."""
-    table, layers, heads = manifest.features, manifest.n_layers, manifest.n_heads
+    table = manifest.features
     random, turns, noise_seed = np.random.default_rng(seed), 3 * manifest.context_length + 2, np.uint64(seed + 12345)
     head, trunk = (ort.InferenceSession(path / f"{graph}.onnx") for graph in ("acquisition", "action"))
 
@@ -109,33 +113,37 @@ def _golden(path: Path, manifest: Manifest, seed: int) -> dict[str, np.ndarray]:
     hidden, past, rows = np.zeros((1, manifest.width), dtype=np.float32), [], []
     for turn in range(turns):
         left = np.array([[manifest.target_return - rewards[: turn + 1].sum(dtype=np.float64)]], dtype=np.float32)
-        feed = {"free": free[turn : turn + 1], "returns_to_go": left} | asked
-        feed |= {"hidden": hidden} if manifest.has_context else {}
-        probs = head.run(["query_probs"], feed)[0]
+        before = np.concatenate([hidden, free[turn : turn + 1], left], axis=1)
+        probs, prepared = head.run(["query_probs", "prepared"], {"before": before} | asked)
         noise = uniforms(np.array([noise_seed]), np.array([turn]), table.n_queries + manifest.action.size)
         query = noise[:, : table.n_queries] < probs
-        kept = past[-manifest.n_slots :] if manifest.has_context else []
-        cache = np.zeros((2, layers, 1, heads, manifest.n_slots, manifest.head_dim), dtype=np.float32)
-        ages = np.full((1, manifest.n_slots), manifest.context_length, dtype=np.int64)
-        for slot, token in enumerate(kept):
-            cache[:, :, :, :, slot] = token
-            ages[0, slot] = len(kept) - slot
-        feed = {
-            "free": free[turn : turn + 1],
-            "costly": costly[turn : turn + 1] * query[:, table.owner],
-            "query": query.astype(np.float32),
-            "returns_to_go": left,
-            "noise": noise[:, table.n_queries :],
-        }
-        feed |= {"keys": cache[0], "values": cache[1], "ages": ages} if manifest.has_context else {}
+        known = costly[turn : turn + 1] * query[:, table.owner]
+        feed = {"prepared": prepared, "acquired": np.concatenate([known, query], axis=1).astype(np.float32)}
+        feed |= {"noise": noise[:, table.n_queries :]} if manifest.samples_action else {}
+        feed |= _cache(manifest, past)
         action, *memory = trunk.run(None, feed)
         row = {"probs": probs[0], "queries": query[0].astype(np.uint8), "actions": action[0]}
         if manifest.has_context:
-            hidden, *token = memory
-            past.append(np.stack(token))
+            hidden, *tokens = memory  # a key and a value of each layer
+            past.append([token[:, :, :, 0] for token in tokens])
             row["hidden"] = hidden[0]
         rows.append(row)
     outputs = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     scalars = {"seed": noise_seed, "target_return": np.float64(manifest.target_return)}
     scalars |= {name: number[0, 0] for name, number in asked.items()}
     return {"free": free, "costly": costly, "rewards": rewards, **outputs, **scalars}
+
+
+def _cache(manifest: Manifest, past: list[list[np.ndarray]]) -> dict[str, np.ndarray]:
+    """The inputs that hold these turns, the oldest first, each in the slot of its turn."""
+    if not manifest.has_context:
+        return {}
+    slots, turn = manifest.n_slots, len(past)
+    feed = {"place": np.array([turn if turn < slots else slots + turn % slots])}
+    for layer in range(manifest.n_layers):
+        for kind, name in enumerate(("key", "value")):
+            ring = np.zeros((1, 1, manifest.n_heads, slots, manifest.head_dim), dtype=np.float32)
+            for t in range(max(0, turn - slots), turn):
+                ring[:, :, :, t % slots] = past[t][2 * layer + kind]
+            feed[f"{name}s_{layer}"] = ring
+    return feed

@@ -50,7 +50,7 @@ class _Graph:
 
     def model(self, inputs: dict[str, tuple], outputs: dict[str, tuple]) -> bytes:
         def ports(shapes: dict[str, tuple]) -> list[onnx.ValueInfoProto]:
-            kinds = {"ages": TensorProto.INT64}
+            kinds = {"place": TensorProto.INT64}
             return [helper.make_tensor_value_info(n, kinds.get(n, TensorProto.FLOAT), s) for n, s in shapes.items()]
 
         graph = helper.make_graph(self.nodes, "tiny", ports(inputs), ports(outputs), self.initializers)
@@ -60,41 +60,36 @@ class _Graph:
 
 
 def acquisition_graph(manifest: Manifest, seed: int) -> bytes:
-    table, inner = manifest.features, manifest.width or _INNER
+    table, inner, width = manifest.features, manifest.width or _INNER, manifest.width
     graph = _Graph(seed)
-    free = graph.scaled("free", table.n_free, 1.0 / np.maximum(np.abs(table.free_range[1]), 1.0))
-    inputs = {"free": ("N", table.n_free), "returns_to_go": ("N", 1)}
-    read = [free, graph.scaled("returns_to_go", 1, 0.1)]
-    if manifest.has_context:
-        inputs, read = {"hidden": ("N", manifest.width), **inputs}, ["hidden", *read]
+    scale = np.concatenate([np.ones(width), 1.0 / np.maximum(np.abs(table.free_range[1]), 1.0), [0.1]])
+    x, columns = graph.scaled("before", scale.size, scale), scale.size
+    inputs = {"before": ("N", columns)}
+    graph.linear(x, columns, manifest.prepared_width, out="prepared")
     if manifest.is_conditioned:
-        inputs, read = {**inputs, "target_cost": ("N", 1)}, [*read, graph.scaled("target_cost", 1, 3.0)]
-    x = graph.op("Concat", *read, axis=1)
-    x = graph.op("Tanh", graph.linear(x, sum(columns for _, columns in inputs.values()), inner))
+        inputs["target_cost"] = ("N", 1)
+        x, columns = graph.op("Concat", x, graph.scaled("target_cost", 1, 3.0), axis=1), columns + 1
+    x = graph.op("Tanh", graph.linear(x, columns, inner))
     graph.op("Sigmoid", graph.linear(x, inner, table.n_queries), out="query_probs")
-    return graph.model(inputs, {"query_probs": ("N", table.n_queries)})
+    return graph.model(inputs, {"query_probs": ("N", table.n_queries), "prepared": ("N", manifest.prepared_width)})
 
 
 def action_graph(manifest: Manifest, seed: int) -> bytes:
-    table, spec, inner = manifest.features, manifest.action, manifest.width or _INNER
+    table, spec, inner, prepared = manifest.features, manifest.action, manifest.width or _INNER, manifest.prepared_width
     graph = _Graph(seed)
-    free = graph.scaled("free", table.n_free, 1.0 / np.maximum(np.abs(table.free_range[1]), 1.0))
-    costly = graph.scaled("costly", table.n_costly, 1.0 / np.clip(np.abs(table.costly_range[1]), 1.0, 100.0))
-    x = graph.op("Concat", free, costly, "query", graph.scaled("returns_to_go", 1, 0.1), axis=1)
-    x = graph.op("Tanh", graph.linear(x, table.n_free + table.n_costly + table.n_queries + 1, inner))
-    inputs = {
-        "free": ("N", table.n_free),
-        "costly": ("N", table.n_costly),
-        "query": ("N", table.n_queries),
-        "returns_to_go": ("N", 1),
-        "noise": ("N", spec.size),
-    }
+    scale = np.append(1.0 / np.clip(np.abs(table.costly_range[1]), 1.0, 100.0), np.ones(table.n_queries))
+    x = graph.op("Concat", graph.scaled("acquired", scale.size, scale), "prepared", axis=1)
+    x = graph.op("Tanh", graph.linear(x, scale.size + prepared, inner))
+    inputs = {"prepared": ("N", prepared), "acquired": ("N", scale.size)}
     outputs = {"action": ("N", spec.size)}
     if manifest.has_context:
         x, inputs, outputs = _trunk(graph, x, manifest, inputs, outputs)
     low = np.array([c.low for c in spec.components], dtype=np.float32)
     span = np.array([c.high - c.low for c in spec.components], dtype=np.float32)
-    score = graph.op("Sigmoid", graph.op("Add", graph.linear(x, inner, spec.size), "noise"))
+    score = graph.linear(x, inner, spec.size)
+    if manifest.samples_action:
+        inputs, score = {**inputs, "noise": ("N", spec.size)}, graph.op("Add", score, "noise")
+    score = graph.op("Sigmoid", score)
     graph.op("Add", graph.op("Mul", score, graph.constant(span)), graph.constant(low), out="action")
     return graph.model(inputs, outputs)
 
@@ -103,27 +98,38 @@ def _trunk(
     graph: _Graph, x: str, manifest: Manifest, inputs: dict[str, tuple], outputs: dict[str, tuple]
 ) -> tuple[str, dict[str, tuple], dict[str, tuple]]:
     """The attention layers over `x`; their output, and all inputs and outputs with the context's."""
-    layers, heads, slots, dim = manifest.n_layers, manifest.n_heads, manifest.n_slots, manifest.head_dim
-    tokens = []
-    for layer in range(layers):
-        x, key, value = _attention(graph, x, layer, manifest)
-        tokens.append((key, value))
+    heads, slots, dim = manifest.n_heads, manifest.n_slots, manifest.head_dim
+    inputs, outputs = {**inputs, "place": ("N",)}, {**outputs, "hidden": ("N", manifest.width)}
+    ages = graph.op("Gather", graph.constant(_ages(slots)), "place", axis=0)  # [N, S]
+    for layer in range(manifest.n_layers):
+        for name in ("key", "value"):
+            inputs[f"{name}s_{layer}"] = ("N", 1, heads, slots, dim)
+            outputs[f"{name}_{layer}"] = ("N", 1, heads, 1, dim)
+        x = _attention(graph, x, layer, ages, manifest)
     graph.op("Identity", x, out="hidden")
-    for index, out in enumerate(("new_keys", "new_values")):
-        parts = [graph.op("Unsqueeze", token[index], graph.ints(0)) for token in tokens]
-        graph.op("Concat", *parts, axis=0, out=out)
-    cache, token = (layers, "N", heads, slots, dim), (layers, "N", heads, dim)
-    inputs = {**inputs, "keys": cache, "values": cache, "ages": ("N", slots)}
-    return x, inputs, {**outputs, "hidden": ("N", manifest.width), "new_keys": token, "new_values": token}
+    return x, inputs, outputs
 
 
-def _attention(graph: _Graph, x: str, layer: int, manifest: Manifest) -> tuple[str, str, str]:
+def _ages(slots: int) -> np.ndarray:
+    """How many turns ago each slot was written, or one more than there are slots where it is empty, by place: played
+    through, a turn at a time."""
+    ages, rows = np.full(slots, slots + 1), []
+    for turn in range(2 * slots):
+        rows.append(ages)
+        ages = np.minimum(ages + 1, slots + 1)
+        ages[turn % slots] = 1
+    return np.stack(rows)
+
+
+def _attention(graph: _Graph, x: str, layer: int, ages: str, manifest: Manifest) -> str:
     """One causal attention step over the cached turns and this one, with a bias by age."""
-    width, heads, dim = manifest.width, manifest.n_heads, manifest.head_dim
-    split = graph.ints(-1, heads, dim)
+    width, heads, dim, slots = manifest.width, manifest.n_heads, manifest.head_dim, manifest.n_slots
+    split, token, ring = graph.ints(-1, heads, dim), graph.ints(-1, 1, heads, 1, dim), graph.ints(-1, heads, slots, dim)
     query, key, value = (graph.op("Reshape", graph.linear(x, width, width), split) for _ in range(3))
-    keys, values = (graph.op("Gather", n, graph.constant(np.array(layer)), axis=0) for n in ("keys", "values"))
-    ages = graph.op("Unsqueeze", "ages", graph.ints(1))  # [N, 1, S]
+    keys, values = (graph.op("Reshape", f"{name}s_{layer}", ring) for name in ("key", "value"))
+    for name, number in (("key", key), ("value", value)):
+        graph.op("Reshape", number, token, out=f"{name}_{layer}")
+    ages = graph.op("Unsqueeze", ages, graph.ints(1))  # [N, 1, S]
     bias = graph.scaled(graph.op("Cast", ages, to=TensorProto.FLOAT), 1, -0.2)
     cached = graph.op("Add", graph.op("Einsum", query, keys, equation="nhd,nhsd->nhs"), bias)
     empty = graph.op("GreaterOrEqual", ages, graph.ints(manifest.context_length))
@@ -133,4 +139,4 @@ def _attention(graph: _Graph, x: str, layer: int, manifest: Manifest) -> tuple[s
     everything = graph.op("Concat", values, graph.op("Unsqueeze", value, graph.ints(2)), axis=2)
     mixed = graph.op("Einsum", weight, everything, equation="nhs,nhsd->nhd")
     mixed = graph.op("Reshape", mixed, graph.ints(-1, width))
-    return graph.op("Add", x, graph.op("Tanh", graph.linear(mixed, width, width))), key, value
+    return graph.op("Add", x, graph.op("Tanh", graph.linear(mixed, width, width)))

@@ -8,17 +8,14 @@ made it (config.json, versions.json, metrics.jsonl) are copied beside it, with t
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
 import shutil
 import tempfile
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import numpy as np
-import onnx
 import torch
 import tyro
 from rich.console import Console
@@ -31,8 +28,7 @@ from training.checkpoint import Trained, load_trained
 from training.config import TrainConfig
 from training.curves import plot_curves
 from training.feature_map import FEATURE_MAP
-from training.graphs import AcquisitionGraph, ActionGraph, FrameActionGraph, example_inputs
-from training.models import BudgetedDecisionTransformer
+from training.graphs import acquisition_graph, action_graph, reads_noise
 from training.policy import ModelConfig
 
 __all__ = ["ExportConfig", "export", "golden_episode", "write_graphs"]
@@ -51,49 +47,9 @@ class ExportConfig:
 
 
 def write_graphs(trained: Trained, folder: Path) -> None:
-    """acquisition.onnx and action.onnx, with a dynamic number of bots N."""
-    model = trained.model
-    before, now = example_inputs(model)
-    _write(AcquisitionGraph(model), before, ["query_probs"], folder / "acquisition.onnx")
-    if isinstance(model, BudgetedDecisionTransformer):
-        outputs = ["action", "hidden", "new_keys", "new_values"]
-        _write(ActionGraph(model), now, outputs, folder / "action.onnx")
-    else:
-        _write(FrameActionGraph(model), now, ["action"], folder / "action.onnx")
-
-
-def _write(
-    graph: torch.nn.Module,
-    inputs: dict[str, torch.Tensor],
-    outputs: list[str],
-    path: Path,
-) -> None:
-    bots = torch.export.Dim("N")
-    dynamic = {name: {1 if name in ("keys", "values") else 0: bots} for name in inputs}
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with warnings.catch_warnings():
-        # The exporter warns of its own internals (deprecated calls, copied nodes): nothing that a user can act on.
-        warnings.simplefilter("ignore")
-        program = torch.onnx.export(
-            graph.eval(),
-            args=(),
-            kwargs=inputs,
-            dynamo=True,
-            dynamic_shapes=dynamic,
-            input_names=list(inputs),
-            output_names=outputs,
-            optimize=True,
-            verbose=False,
-        )
-    onnx.save(_without_traces(program.model_proto), path)
-
-
-def _without_traces(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The exporter notes on every node which source lines made it, with their full paths: not for a bundle."""
-    for part in (model, model.graph, *model.graph.node, *model.graph.value_info, *model.graph.initializer):
-        part.ClearField("metadata_props")
-        part.ClearField("doc_string")
-    return model
+    """acquisition.onnx and action.onnx, for any number of bots N."""
+    for name, graph in (("acquisition", acquisition_graph), ("action", action_graph)):
+        (folder / f"{name}.onnx").write_bytes(graph(trained.model).content())
 
 
 @torch.no_grad()
@@ -165,6 +121,8 @@ def _manifest(trained: Trained, folder: Path, asked: ExportConfig) -> Manifest:
         target_return=facts.target_return,
         target_cost=sizes.target_cost if sizes.budget_conditioned else None,
         **_context_sizes(sizes),
+        prepared_width=sizes.encoder_width,
+        samples_action=reads_noise(trained.model),
         budget=config.frame_budget,
         tolerance=asked.tolerance,
         files=files,

@@ -1,92 +1,227 @@
-"""The two graphs that a bundle serves: the split-off acquisition head, and one step of the action policy.
+"""The two graphs that a bundle serves, made by hand from the trained weights with as few nodes as there can be.
 
-Thin modules over the trained network's own parameters; raw numbers in and out. A network without memory has no hidden
-state and no cache: those ports are left out. This module knows nothing about files.
+What does not depend on a bot is computed here, once: normalisation goes into the weights that follow it, a cosine is a
+sine a quarter turn on, the scale of attention goes into the queries, and the bias by age is a table over the places of
+the ring (docs/adr/0010). Shape letters as in `training.models`; X numbers before the query, P = 2S places of a ring.
 """
 
 from __future__ import annotations
 
-import torch
+import math
+
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from training.action_heads import BinsHead
+from training.action_nodes import action_nodes
 from training.mlp import BudgetedPerceptron
-from training.models import BudgetedDecisionTransformer
-from training.policy import BudgetedPolicy
+from training.models import Attention, BudgetedDecisionTransformer
+from training.onnx_graph import OnnxGraph
+from training.policy import COST_OCTAVES, BudgetedPolicy
 
-__all__ = ["AcquisitionGraph", "ActionGraph", "FrameActionGraph", "example_inputs"]
+__all__ = ["acquisition_graph", "action_graph", "reads_noise"]
 
-
-class AcquisitionGraph(nn.Module):
-    """hidden [N, W] (with memory), free [N, F], returns_to_go [N, 1], target_cost [N, 1] (where C is an input)
-    -> query_probs [N, M]."""
-
-    def __init__(self, model: BudgetedPolicy) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(
-        self, free: Tensor, returns_to_go: Tensor, hidden: Tensor | None = None, target_cost: Tensor | None = None
-    ) -> Tensor:
-        if target_cost is None:
-            target_cost = torch.full_like(returns_to_go, self.model.config.target_cost)
-        memory = free[:, :0] if hidden is None else hidden
-        return self.model.query_probs(memory, self.model.know(free, returns_to_go, target_cost))
+_MASKED = -1e9
+# A mean so many scales from zero is taken off before the weights: float32 has seven digits, and a sum of two large
+# numbers that cancel would keep few of them.
+_FAR = 100.0
+_Doubles = NDArray[np.float64]
 
 
-class ActionGraph(nn.Module):
-    """One turn for N bots: their features and caches -> actions, the trunk's state, and the new cache entries."""
-
-    def __init__(self, model: BudgetedDecisionTransformer) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(
-        self,
-        free: Tensor,  # [N, F]
-        costly: Tensor,  # [N, D], anything finite where not acquired
-        query: Tensor,  # [N, M], 0 or 1
-        returns_to_go: Tensor,  # [N, 1]
-        noise: Tensor,  # [N, A]
-        keys: Tensor,  # [L, N, H, S, h]
-        values: Tensor,  # [L, N, H, S, h]
-        ages: Tensor,  # [N, S], 1 to K - 1, or K for an empty slot
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        model = self.model
-        x = model.tokens(model.know(free, returns_to_go, torch.zeros_like(returns_to_go), costly), query)
-        new_keys, new_values = [], []
-        for layer, block in enumerate(model.blocks):
-            x, key, value = block.step(x, keys[layer], values[layer], ages)
-            new_keys.append(key)
-            new_values.append(value)
-        hidden = model.norm_out(x)
-        return model.action_head.actions(hidden, noise), hidden, torch.stack(new_keys), torch.stack(new_values)
+def reads_noise(model: BudgetedPolicy) -> bool:
+    """Whether the action graph has an input for noise: a component of the action is sampled."""
+    head = model.action_head
+    return isinstance(head, BinsHead) and any(head.sampled)
 
 
-class FrameActionGraph(nn.Module):
-    """One turn of N bots that remember nothing: their features -> actions [N, A]."""
+def acquisition_graph(model: BudgetedPolicy) -> OnnxGraph:
+    """before [N, X] (the last hidden state, free, return-to-go) and, where C is an input, target_cost [N, 1]
+    -> query_probs [N, M], prepared [N, E]: the encoder's share of what is known before the query."""
+    config, graph, x = model.config, OnnxGraph(), "before"
+    graph.inputs["before"] = ("N", model.memory_width + config.n_free + 1)
+    mean, scale = _statistics(model)
+    waves, frequencies = model.memory_width + model.wave_number.numpy(), _numpy(model.wave_frequency)
+    if config.cost_range is not None:
+        low, high = config.cost_range
+        graph.inputs["target_cost"] = ("N", 1)
+        clipped = graph.op("Clip", "target_cost", graph.floats(low), graph.floats(high))
+        x = graph.op("Concat", x, graph.op("Log", clipped), axis=1)
+        mean, scale = np.append(mean, math.log(low)), np.append(scale, math.log(high / low))
+        waves = np.append(waves, np.full(COST_OCTAVES, len(mean) - 1))
+        frequencies = np.append(frequencies, math.pi * 2.0 ** np.arange(COST_OCTAVES))
+    rows, n_waves = len(mean), len(waves)
+    swing = np.zeros((rows, n_waves))
+    swing[waves, np.arange(n_waves)] = frequencies
+    if (np.abs(mean) * np.maximum(swing.max(axis=1, initial=0.0), 1.0) > _FAR * scale).any():
+        x, mean = graph.op("Sub", x, graph.floats(mean)), np.zeros(rows)
+    angles, phase = _normalised(np.concatenate([swing, swing], axis=1), mean, scale)
+    phase[n_waves:] += math.pi / 2
+    x = graph.op("Concat", x, graph.op("Sin", graph.gemm(x, angles, phase)), axis=1) if n_waves else x
+    places = _context_rows(model, rows, n_waves)
 
-    def __init__(self, model: BudgetedPerceptron) -> None:
-        super().__init__()
-        self.model = model
+    def read(layer: nn.Linear) -> tuple[_Doubles, _Doubles]:
+        weight = np.zeros((rows + 2 * n_waves, config.encoder_width))
+        weight[places[: layer.in_features]] = _numpy(layer.weight).T
+        if not config.reads_returns:
+            weight[model.memory_width + config.n_free] = 0.0
+        weight, bias = _normalised(weight, mean, scale)
+        return weight, bias + _numpy(layer.bias)
 
-    def forward(self, free: Tensor, costly: Tensor, query: Tensor, returns_to_go: Tensor, noise: Tensor) -> Tensor:
-        model = self.model
-        known = model.know(free, returns_to_go, torch.zeros_like(returns_to_go), costly)
-        return model.action_head.actions(model.hiddens(known, query), noise)
+    graph.gemm(x, *read(model.encode_context), out="prepared")
+    weight, bias = read(model.acquisition_head.from_context)
+    if model.acquisition_head.from_memory is not None:
+        weight[: model.memory_width] = _numpy(model.acquisition_head.from_memory.weight).T
+    _query_nodes(graph, model, x, weight, bias)
+    graph.outputs = {"query_probs": ("N", config.n_queries), "prepared": ("N", config.encoder_width)}
+    return graph
 
 
-def example_inputs(model: BudgetedPolicy) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Inputs of both graphs by name, for two bots: what an exporter traces them with."""
-    n, config = 2, model.config
-    free, togo = torch.zeros(n, config.n_free), torch.zeros(n, 1)
-    before, now = {"free": free, "returns_to_go": togo}, {"free": free}
-    now |= {"costly": torch.zeros(n, len(config.owner)), "query": torch.zeros(n, config.n_queries)}
-    now |= {"returns_to_go": togo, "noise": torch.zeros(n, config.n_actions)}
-    if config.has_memory:
-        slots = config.context_length - 1
-        cache = torch.zeros(config.n_layers, n, config.n_heads, slots, config.width // config.n_heads)
-        before["hidden"] = torch.zeros(n, config.width)
-        now |= {"keys": cache, "values": cache.clone(), "ages": torch.full((n, slots), config.context_length)}
-    if config.budget_conditioned:
-        before["target_cost"] = torch.ones(n, 1)
-    return before, now
+def _statistics(model: BudgetedPolicy) -> tuple[_Doubles, _Doubles]:
+    """Mean and scale of each number of `before`, [X]; the hidden state is taken as it is."""
+    parts, width = (model.normalise_free, model.normalise_return), model.memory_width
+    mean = np.concatenate([np.zeros(width), *(_numpy(part.mean) for part in parts)])
+    return mean, np.concatenate([np.ones(width), *(_numpy(part.scale) for part in parts)])
+
+
+def _context_rows(model: BudgetedPolicy, rows: int, n_waves: int) -> NDArray[np.int64]:
+    """Which row of the graph's numbers (`before`, the target cost, all sines, all cosines) each number is that
+    `BudgetedPolicy.know` puts together."""
+    config, free = model.config, len(model.wave_number)
+    sines, cosines = rows + np.arange(n_waves), rows + n_waves + np.arange(n_waves)
+    first = model.memory_width + np.arange(config.n_free)
+    cost = np.stack([sines[free:], cosines[free:]], axis=1).ravel()
+    context = [first, sines[:free], cosines[:free], [model.memory_width + config.n_free]]
+    return np.concatenate([*context, [rows - 1] if config.budget_conditioned else [], cost]).astype(np.int64)
+
+
+def _query_nodes(graph: OnnxGraph, model: BudgetedPolicy, x: str, weight: _Doubles, bias: _Doubles) -> None:
+    """`query_probs` of the numbers `x`, read by the acquisition head's hidden layer with these weights."""
+    config, out = model.config, model.acquisition_head.out
+    if config.acquisition == "learned":
+        hidden = graph.op("Relu", graph.gemm(x, weight, bias))
+        graph.op("Sigmoid", graph.gemm(hidden, _numpy(out.weight).T, _numpy(out.bias)), out="query_probs")
+    elif config.acquisition == "random" and config.budget_conditioned:
+        graph.gemm("target_cost", np.ones((1, config.n_queries)), np.zeros(config.n_queries), out="query_probs")
+    else:
+        prob = config.target_cost if config.acquisition == "random" else float(config.acquisition == "all")
+        nothing = np.zeros((graph.inputs["before"][1], config.n_queries))
+        graph.gemm("before", nothing, np.full(config.n_queries, prob), out="query_probs")
+
+
+def action_graph(model: BudgetedPolicy) -> OnnxGraph:
+    """prepared [N, E], acquired [N, D + M] (costly numbers, zero where not acquired; the query, 0 or 1), noise [N, A]
+    where any is read -> action [N, A]. With memory also place [N] and, of each layer l, keys_l and values_l
+    [N, 1, H, S, h] -> hidden [N, W], key_l and value_l [N, 1, H, 1, h]."""
+    config, graph = model.config, OnnxGraph()
+    graph.inputs["prepared"] = ("N", config.encoder_width)
+    graph.inputs["acquired"] = ("N", len(config.owner) + config.n_queries)
+    if reads_noise(model):
+        graph.inputs["noise"] = ("N", config.n_actions)
+    graph.outputs["action"] = ("N", config.n_actions)
+    x = graph.op("Relu", _encoder_node(graph, model))
+    if isinstance(model, BudgetedDecisionTransformer):
+        x = _trunk_nodes(graph, model, _linear(graph, x, model.embed))
+    elif isinstance(model, BudgetedPerceptron):
+        for layer in model.layers:
+            x = _linear(graph, x, layer) if isinstance(layer, nn.Linear) else graph.op("Relu", x)
+    action_nodes(graph, model.action_head, x)
+    return graph
+
+
+def _encoder_node(graph: OnnxGraph, model: BudgetedPolicy) -> str:
+    """prepared + W[(costly - mean) / scale ∘ q, q]: a number that was not acquired is zero, and so is its query, so the
+    mean may come off through the query."""
+    mean, scale = _numpy(model.normalise_costly.mean), _numpy(model.normalise_costly.scale)
+    owner, numbers, plus = np.array(model.config.owner), len(mean), "prepared"
+    weight = _numpy(model.encode_acquired.weight).T.copy()
+    weight[:numbers] /= scale[:, None]
+    far = np.flatnonzero(np.abs(mean) > _FAR * scale)
+    if far.size:
+        less_mean = np.zeros((len(weight), far.size))
+        less_mean[far, np.arange(far.size)] = 1.0
+        less_mean[numbers + owner[far], np.arange(far.size)] = -mean[far]
+        plus = graph.gemm(graph.gemm("acquired", less_mean, np.zeros(far.size)), weight[far], plus)
+        weight[far] = 0.0
+    np.subtract.at(weight, numbers + owner, mean[:, None] * weight[:numbers])
+    return graph.gemm("acquired", weight, plus)
+
+
+def _trunk_nodes(graph: OnnxGraph, model: BudgetedDecisionTransformer, x: str) -> str:
+    """One turn through every block; the state after it."""
+    config, slots = model.config, model.config.context_length - 1
+    heads, head = config.n_heads, config.width // config.n_heads
+    graph.inputs["place"], graph.outputs["hidden"] = ("N",), ("N", config.width)
+    graph.whole.add("place")
+    table = np.stack([_age_table(block.attention) for block in model.blocks], axis=1)  # [P, L, H, 1, S]
+    biases = graph.op("Gather", graph.floats(table), "place", axis=0)
+    biases_L = graph.split(biases, [1] * config.n_layers, axis=1) if config.n_layers > 1 else [biases]
+    for layer, block in enumerate(model.blocks):
+        for name in ("key", "value"):
+            graph.inputs[f"{name}s_{layer}"] = ("N", 1, heads, slots, head)
+            graph.outputs[f"{name}_{layer}"] = ("N", 1, heads, 1, head)
+        mixed = _attention_nodes(graph, block.attention, layer, _norm(graph, x, block.norm_attention), biases_L[layer])
+        x = graph.op("Add", _linear(graph, mixed, block.attention.out), x)
+        inner, outer = block.mlp[0], block.mlp[-1]
+        # One more hidden unit, always 1, carries the second bias, for the residual takes its place.
+        weight = np.concatenate([_numpy(inner.weight).T, np.zeros((config.width, 1))], axis=1)
+        hidden = graph.op("Relu", graph.gemm(_norm(graph, x, block.norm_mlp), weight, np.append(_numpy(inner.bias), 1)))
+        x = graph.gemm(hidden, np.concatenate([_numpy(outer.weight).T, _numpy(outer.bias)[None]]), x)
+    return _norm(graph, x, model.norm_out, out="hidden")
+
+
+def _attention_nodes(graph: OnnxGraph, attention: Attention, layer: int, x: str, bias: str) -> str:
+    """Attention of this turn over the ring and itself, [N, W]: the new token is scored beside the ring, so that
+    nothing is concatenated but scores."""
+    heads, head = attention.n_heads, attention.head_dim
+    weight, shift = _numpy(attention.qkv.weight).T.copy(), _numpy(attention.qkv.bias).copy()
+    weight[:, : heads * head] /= math.sqrt(head)
+    shift[: heads * head] /= math.sqrt(head)
+    apart = graph.op("Reshape", graph.gemm(x, weight, shift), graph.ints([-1, 3, heads, 1, head]))
+    names = [f"query_{layer}", f"key_{layer}", f"value_{layer}"]
+    query, key, value = graph.split(apart, [1, 1, 1], axis=1, outs=names)
+    # onnxruntime multiplies by the transpose of the keys as they lie.
+    scores = graph.op("MatMul", query, graph.op("Transpose", f"keys_{layer}", perm=[0, 1, 2, 4, 3]))
+    own = graph.op("ReduceSum", graph.op("Mul", query, key), graph.ints([-1]), keepdims=1)
+    scores = graph.op("Concat", graph.op("Add", scores, bias), own, axis=-1)
+    weights = graph.op("Softmax", scores, axis=-1)
+    past, now = graph.split(weights, [attention.context_length - 1, 1], axis=4)
+    mixed = graph.op("MatMul", past, f"values_{layer}")
+    mixed = graph.op("Add", mixed, graph.op("Mul", now, value))
+    return graph.op("Reshape", mixed, graph.ints([-1, heads * head]))
+
+
+def _age_table(attention: Attention) -> _Doubles:
+    """Score added to each slot at each place of the ring, [P, H, 1, S], less what age 0 gets.
+
+    Before turn t the place is t while t < S: slot s holds turn s, or nothing yet. From then on it is S + t mod S: slot
+    t mod S holds the oldest turn, S ago.
+    """
+    slots = attention.context_length - 1
+    place, slot = np.arange(2 * slots)[:, None], np.arange(slots)
+    filling = place < slots
+    ages = np.where(filling, place - slot, (place - slot - 1) % slots + 1)
+    empty = filling & (slot >= place)
+    bias = _numpy(attention.age_bias)
+    table_PHS = (bias[:, ages] - bias[:, :1, None]).transpose(1, 0, 2)
+    return np.where(empty[:, None], _MASKED, table_PHS)[:, :, None]
+
+
+def _linear(graph: OnnxGraph, x: str, layer: nn.Linear) -> str:
+    return graph.gemm(x, _numpy(layer.weight).T, _numpy(layer.bias))
+
+
+def _norm(graph: OnnxGraph, x: str, layer: nn.LayerNorm, out: str | None = None) -> str:
+    weight, bias = graph.floats(_numpy(layer.weight)), graph.floats(_numpy(layer.bias))
+    return graph.op("LayerNormalization", x, weight, bias, out=out, axis=-1, epsilon=layer.eps)
+
+
+def _normalised(weight: _Doubles, mean: _Doubles, scale: _Doubles) -> tuple[_Doubles, _Doubles]:
+    """Weight and bias that make of raw numbers what `weight` makes of normalised ones (its further rows stay)."""
+    weight = weight.copy()
+    weight[: len(scale)] /= scale[:, None]
+    return weight, -mean @ weight[: len(scale)]
+
+
+def _numpy(tensor: Tensor) -> _Doubles:
+    return tensor.detach().cpu().double().numpy()

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from training.action_heads import ActionHead, BinsHead, GaussianHead
 
-__all__ = ["BudgetedPolicy", "Known", "ModelConfig"]
+__all__ = ["COST_OCTAVES", "BudgetedPolicy", "Known", "ModelConfig"]
 
-_COST_OCTAVES = 3
+COST_OCTAVES = 3  # sine/cosine octaves of the target cost
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class BudgetedPolicy(nn.Module, ABC):
         self.normalise_return = Normalisation(1)
         self.encode_acquired = nn.Linear(n_costly + config.n_queries, config.encoder_width, bias=False)
         self.encode_context = nn.Linear(n_context, config.encoder_width)
-        n_cost = 1 + 2 * _COST_OCTAVES if config.budget_conditioned else 0
+        n_cost = 1 + 2 * COST_OCTAVES if config.budget_conditioned else 0
         self.acquisition_head = AcquisitionHead(memory, n_context + n_cost, config)
         self.action_head = _action_head(config)
 
@@ -205,5 +205,5 @@ def _cost_waves(target_cost: Tensor, low: float, high: float) -> Tensor:
     """C on a logarithmic scale, 0 to 1 over the range that was trained, with sines and cosines of it, [..., 7]. What
     lies outside is taken for the nearer end: no network knows what it was never asked."""
     z = torch.log(target_cost.clamp(low, high) / low) / math.log(high / low)
-    waves = [wave(z * math.pi * 2**k) for k in range(_COST_OCTAVES) for wave in (torch.sin, torch.cos)]
+    waves = [wave(z * math.pi * 2**k) for k in range(COST_OCTAVES) for wave in (torch.sin, torch.cos)]
     return torch.cat([z, *waves], dim=-1)

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bot_runtime.batch import Batch
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
-from bot_runtime.policy import Policy, Step
+from bot_runtime.policy import Policy
 from bot_runtime.turns import Actions, Queries
 from protocol.features import FeatureTable
 from tests.bundles import make_bundle
@@ -69,18 +70,16 @@ class Poisoned:
         self.probs: dict[int, float] = {}
         self.step: dict[int, tuple[str, float]] = {}
 
-    def query_probs(self, *arrays: np.ndarray) -> np.ndarray:
-        probs = self._policy.query_probs(*arrays).copy()
+    def query_probs(self, batch: Batch) -> None:
+        self._policy.query_probs(batch)
         for row, number in self.probs.items():
-            probs[row, -1] = number
-        return probs
+            batch.probs_NM[row, -1] = number
 
-    def act(self, *arrays: np.ndarray) -> Step:
-        step = Step(*(array.copy() for array in self._policy.act(*arrays)))
+    def act(self, batch: Batch) -> None:
+        self._policy.act(batch)
         for row, (field, number) in self.step.items():
-            array = getattr(step, field)
-            (array[:, row] if field.startswith("new") else array[row])[..., -1] = number
-        return step
+            kind = {"keys": 0, "values": 1}.get(field)
+            (getattr(batch, field)[row] if kind is None else batch.tokens[:, kind, row])[..., -1] = number
 
 
 @pytest.fixture(scope="session")

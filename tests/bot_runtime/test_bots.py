@@ -117,7 +117,6 @@ def test_bots_regroup_between_frames(engine: Engine) -> None:
     assert engine.bots.counters.skipped_frames == 2 * 6 + 2 * 6 + 0
     engine.bots.stop(handles)
     assert engine.bots._turns._turns == {}
-    assert engine.bots._turns._members == {}
 
 
 def test_old_turns_are_forgotten(engine: Engine) -> None:
@@ -163,7 +162,7 @@ def test_a_budget_of_one_is_no_budget(tmp_path: Path) -> None:
     """All probabilities are 1: the whole table is asked for, rounding and call cost notwithstanding."""
     engine = Engine(Bots(Bundle.load(make_bundle(tmp_path / "free", budget=1.0)), max_bots=2))
     engine.bots._policy = Poisoned(engine.bots._policy)
-    engine.bots._policy.query_probs = lambda *arrays: np.ones((1, 5), dtype=np.float32)
+    engine.bots._policy.query_probs = lambda batch: batch.probs_NM.fill(1.0)
     handles = engine.bots.start(1, cost_model=CostModel(1000.0, (0.1,) * 5))
     assert engine.ask(handles, 0).query_NM.all()
 

@@ -16,8 +16,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, multiple, rule
 
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
+from bot_runtime.context import Contexts
 from bot_runtime.noise import uniforms
-from bot_runtime.policy import Cache, Policy
+from bot_runtime.policy import Policy
 from protocol import errors
 
 MAX_BOTS = 4
@@ -42,8 +43,9 @@ class Asked:
 class ReferenceBot:
     seed: int
     left: float
-    past: list[np.ndarray] = field(default_factory=list)  # [2, L, H, d] a turn
+    past: list[np.ndarray] = field(default_factory=list)  # [L, 2, H, d] a turn
     hidden: np.ndarray | None = None
+    prepared: np.ndarray | None = None
     asked: Asked | None = None
 
 
@@ -59,23 +61,26 @@ class Reference:
         return uniforms(np.array([bot.seed], dtype=np.uint64), np.array([len(bot.past)]), count)
 
     def probs(self, bot: ReferenceBot, free: np.ndarray, left: float) -> np.ndarray:
-        hidden = np.zeros(self.manifest.width) if bot.hidden is None else bot.hidden
-        return self.policy.query_probs(hidden[None], free[None], np.array([left]), np.ones(1))
+        batch = Contexts(self.manifest, 1).batch(np.array([0]))
+        batch.free_NF[:], batch.left_N1[:], batch.target_cost_N1[:] = free, left, 1.0
+        if bot.hidden is not None:
+            batch.past_NW[:] = bot.hidden
+        self.policy.query_probs(batch)
+        bot.prepared = batch.asked_NE.copy()
+        return batch.probs_NM
 
-    def act(self, bot: ReferenceBot, free: np.ndarray, costly: np.ndarray, query: np.ndarray) -> np.ndarray:
-        m = self.manifest
-        cache, ages = (
-            np.zeros((2, m.n_layers, 1, m.n_heads, m.n_slots, m.head_dim)),
-            np.full((1, m.n_slots), m.context_length),
-        )
-        for age, token in enumerate(bot.past[::-1][: m.n_slots], start=1):
-            cache[:, :, 0, :, age - 1], ages[0, age - 1] = token, age
-        known = costly * query[m.features.owner]
-        noise = self.noise(bot)[:, m.features.n_queries :]
-        step = self.policy.act(free[None], known[None], query[None], np.array([bot.left]), noise, Cache(*cache), ages)
-        bot.past.append(np.stack([step.new_keys[:, 0], step.new_values[:, 0]]))
-        bot.hidden = step.hidden_NW[0]
-        return step.action_NA[0]
+    def act(self, bot: ReferenceBot, costly: np.ndarray, query: np.ndarray) -> np.ndarray:
+        batch, turn, slots = Contexts(self.manifest, 1).batch(np.array([0])), len(bot.past), self.manifest.n_slots
+        for t in range(max(0, turn - slots), turn):
+            batch.memory[:, :, 0, :, t % slots] = bot.past[t]
+        if slots:
+            batch.place_N[:] = turn if turn < slots else slots + turn % slots
+        batch.prepared_NE[:], batch.noise_NA[:] = bot.prepared, self.noise(bot)[:, self.manifest.features.n_queries :]
+        batch.costly_ND[:], batch.query_NM[:] = costly * query[self.manifest.features.owner], query
+        self.policy.act(batch)
+        bot.past.append(batch.tokens[:, :, 0].copy())
+        bot.hidden = batch.hidden_NW[0].copy()
+        return batch.action_NA[0]
 
     def query_error(self, handles: list[int], frame: int, content: tuple[int, float]) -> type[Exception] | None:
         if any(handle not in self.bots for handle in handles):
@@ -207,8 +212,7 @@ class BotsMachine(RuleBasedStateMachine):
             return
         asked.submitted, asked.action = content, actions.action_NA
         for row, handle in enumerate(named):
-            free = self.values(frame, asked.content[0], handle, self.table.free_range)
-            expected = self.reference.act(self.reference.bots[handle], free, costly[row], query[row])
+            expected = self.reference.act(self.reference.bots[handle], costly[row], query[row])
             np.testing.assert_allclose(actions.action_NA[row], expected, atol=1e-4)
 
     @invariant()

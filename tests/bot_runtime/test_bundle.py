@@ -77,7 +77,10 @@ def test_missing_linked_or_not_a_file(copy: Path, file: str) -> None:
 @pytest.mark.parametrize(
     "fields",
     [
-        {"schema_version": 2},
+        {"schema_version": 3},
+        {"schema_version": "2"},
+        {"prepared_width": 0},
+        {"samples_action": 1},
         {"name": "../evil"},
         {"name": "Tiny"},
         {"name": "tiny\n"},
@@ -109,6 +112,13 @@ def test_missing_linked_or_not_a_file(copy: Path, file: str) -> None:
 def test_illegal_manifest(copy: Path, fields: dict[str, object]) -> None:
     change_manifest(copy, **fields)
     with pytest.raises(BadBundle, match=r"manifest\.json"):
+        Bundle.load(copy)
+
+
+def test_a_bundle_of_an_earlier_schema_says_what_to_do(copy: Path) -> None:
+    """Before its other fields are looked at: those were others then."""
+    change_manifest(copy, schema_version=1, width="64")
+    with pytest.raises(BadBundle, match=r"manifest\.json has schema_version 1, expected 2: export the run again"):
         Bundle.load(copy)
 
 

@@ -52,7 +52,7 @@ def test_a_failed_feature_is_as_if_never_asked_for(bundle: Bundle) -> None:
     assert actions[0] == actions[1] != actions[2]
 
 
-@pytest.mark.parametrize("field", ["action_NA", "hidden_NW", "new_keys", "new_values"])
+@pytest.mark.parametrize("field", ["action_NA", "hidden_NW", "keys", "values"])
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 def test_a_step_that_is_not_finite_is_not_taken(bundle: Bundle, field: str, number: float) -> None:
     """The bot repeats its last action, and then plays on as if the bad frame had been abandoned."""

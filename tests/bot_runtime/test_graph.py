@@ -25,9 +25,10 @@ def change_graph(path: Path, file: str, change: Callable[[onnx.ModelProto], None
 
 
 def rename_input(model: onnx.ModelProto) -> None:
+    known = model.graph.input[0].name
     for node in model.graph.node:
-        node.input[:] = ["observed" if name == "free" else name for name in node.input]
-    next(port for port in model.graph.input if port.name == "free").name = "observed"
+        node.input[:] = ["observed" if name == known else name for name in node.input]
+    model.graph.input[0].name = "observed"
 
 
 def freeze_batch(model: onnx.ModelProto) -> None:
@@ -41,7 +42,7 @@ def use_a_loop(model: onnx.ModelProto) -> None:
 
 def use_a_subgraph_in_an_allowed_op(model: onnx.ModelProto) -> None:
     body = helper.make_graph([], "body", [], [])
-    model.graph.node.append(helper.make_node("Identity", ["free"], ["same"], body=body))
+    model.graph.node.append(helper.make_node("Identity", ["prepared"], ["same"], body=body))
 
 
 def use_another_domain(model: onnx.ModelProto) -> None:

@@ -5,85 +5,104 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bot_runtime.batch import Batch
 from bot_runtime.bundle import Bundle
-from bot_runtime.policy import Cache, Policy, Step
+from bot_runtime.context import Contexts
+from bot_runtime.policy import Policy
+
+READ = ("prepared_NE", "costly_ND", "query_NM", "noise_NA", "place_N", "memory")
 
 
-def inputs(bundle: Bundle, n_bots: int) -> dict[str, np.ndarray]:
+def batch_of(bundle: Bundle, n_bots: int) -> Batch:
+    """A batch whose every input is random, with a full ring."""
     manifest, random = bundle.manifest, np.random.default_rng(0)
-    table, head = manifest.features, (manifest.n_heads, manifest.n_slots, manifest.head_dim)
-    return {
-        "free_NF": random.normal(size=(n_bots, table.n_free)),
-        "costly_ND": random.normal(size=(n_bots, table.n_costly)),
-        "query_NM": random.random((n_bots, table.n_queries)) < 0.5,
-        "returns_to_go_N": random.normal(size=n_bots),
-        "noise_NA": random.random((n_bots, manifest.action.size)),
-        "keys": random.normal(size=(manifest.n_layers, n_bots, *head)),
-        "values": random.normal(size=(manifest.n_layers, n_bots, *head)),
-        "ages_NS": np.tile(np.arange(1, manifest.n_slots + 1), (n_bots, 1)),
-    }
+    batch = Contexts(manifest, n_bots).batch(np.arange(n_bots))
+    for array in (batch.before_NX, batch.target_cost_N1, batch.prepared_NE, batch.costly_ND, batch.memory):
+        array[...] = random.normal(size=array.shape)
+    batch.query_NM[...] = random.random(batch.query_NM.shape) < 0.5
+    batch.noise_NA[...] = random.random(batch.noise_NA.shape)
+    batch.place_N[...] = manifest.n_slots
+    return batch
 
 
-def act(policy: Policy, feed: dict[str, np.ndarray]) -> Step:
-    rest = {name: array for name, array in feed.items() if name not in ("keys", "values")}
-    return policy.act(cache=Cache(feed["keys"], feed["values"]), **rest)
+def acted(policy: Policy, batch: Batch) -> list[np.ndarray]:
+    policy.act(batch)
+    return [array.copy() for array in (batch.action_NA, batch.hidden_NW, batch.tokens)]
 
 
-@pytest.mark.parametrize(
-    "name", ["free_NF", "costly_ND", "query_NM", "returns_to_go_N", "noise_NA", "keys", "values", "ages_NS"]
-)
+@pytest.mark.parametrize("name", [*READ, "keys", "values"])
 def test_every_input_of_the_action_graph_matters(bundle: Bundle, name: str) -> None:
-    policy, feed = Policy(bundle), inputs(bundle, 2)
-    before = act(policy, feed)
-    changed = ~feed[name] if name == "query_NM" else feed[name] + 1
-    after = act(policy, {**feed, name: changed})
-    assert np.abs(after.action_NA - before.action_NA).max() > 1e-3
+    policy, batch = Policy(bundle), batch_of(bundle, 2)
+    before = acted(policy, batch)[0]
+    parts = {"keys": batch.memory[:, 0], "values": batch.memory[:, 1]}
+    array = parts[name] if name in parts else getattr(batch, name)
+    array[...] = 1.0 - array if name == "query_NM" else array + 1
+    assert np.abs(acted(policy, batch)[0] - before).max() > 1e-3
 
 
 def test_an_empty_slot_holds_anything(bundle: Bundle) -> None:
-    policy, feed = Policy(bundle), inputs(bundle, 2)
-    feed["ages_NS"][:, 1] = bundle.manifest.context_length
-    before = act(policy, feed)
-    for name in ("keys", "values"):
-        feed[name][:, :, :, 1] = 100.0
-    for old, new in zip(before, act(policy, feed), strict=True):
+    policy, batch = Policy(bundle), batch_of(bundle, 2)
+    batch.place_N[...] = 1
+    before = acted(policy, batch)
+    batch.memory[:, :, :, :, 1:] = 100.0
+    for old, new in zip(before, acted(policy, batch), strict=True):
         assert np.array_equal(old, new)
 
 
-def test_slots_come_in_any_order(bundle: Bundle) -> None:
-    policy, feed = Policy(bundle), inputs(bundle, 2)
-    before = act(policy, feed)
-    turned = {name: feed[name][:, :, :, ::-1] for name in ("keys", "values")}
-    after = act(policy, {**feed, **turned, "ages_NS": feed["ages_NS"][:, ::-1]})
-    for old, new in zip(before, after, strict=True):
-        np.testing.assert_allclose(new, old, atol=1e-5)
+def test_the_same_past_is_the_same_wherever_the_ring_begins(bundle: Bundle) -> None:
+    policy, batch, slots = Policy(bundle), batch_of(bundle, 2), bundle.manifest.n_slots
+    before, memory = acted(policy, batch), batch.memory.copy()
+    for turned in range(1, slots):
+        batch.memory[...], batch.place_N[...] = np.roll(memory, turned, axis=4), slots + turned
+        for old, new in zip(before, acted(policy, batch), strict=True):
+            np.testing.assert_allclose(new, old, atol=1e-5)
+        batch.place_N[...] = slots
+        assert np.abs(acted(policy, batch)[0] - before[0]).max() > 1e-4
 
 
 def test_rows_are_separate(bundle: Bundle) -> None:
-    policy, feed = Policy(bundle), inputs(bundle, 3)
-    together = act(policy, feed)
-    for row in range(3):
-        by_layer = {name: feed[name][:, row : row + 1] for name in ("keys", "values")}
-        alone = act(policy, {name: array[row : row + 1] for name, array in feed.items()} | by_layer)
-        np.testing.assert_allclose(alone.action_NA[0], together.action_NA[row], atol=1e-5)
-        np.testing.assert_allclose(alone.new_keys[:, 0], together.new_keys[:, row], atol=1e-5)
+    """In a batch of the arena's rows, in one of copies, and alone."""
+    policy, contexts = Policy(bundle), Contexts(bundle.manifest, 3)
+    source, batch = batch_of(bundle, 3), contexts.batch(np.arange(3))
+    for name in ("before_NX", "target_cost_N1", *READ):
+        getattr(batch, name)[...] = getattr(source, name)
+    policy.query_probs(batch)
+    probs, prepared = batch.probs_NM.copy(), batch.asked_NE.copy()
+    together = acted(policy, batch)
+    for slots in ([0], [1], [2], [2, 0], [0, 1], [1, 2, 0]):
+        some = contexts.batch(np.array(slots))
+        some.fetch_past()
+        some.fetch_context()
+        for name in ("acquired_NY", "noise_NA", "target_cost_N1"):
+            getattr(some, name)[...] = getattr(batch, name)[slots]
+        policy.query_probs(some)
+        np.testing.assert_allclose(some.probs_NM, probs[slots], atol=1e-5)
+        np.testing.assert_allclose(some.asked_NE, prepared[slots], atol=1e-5)
+        action, hidden, tokens = acted(policy, some)
+        np.testing.assert_allclose(action, together[0][slots], atol=1e-5)
+        np.testing.assert_allclose(hidden, together[1][slots], atol=1e-5)
+        np.testing.assert_allclose(tokens, together[2][:, :, slots], atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["free_NF", "costly_ND", "query_NM", "returns_to_go_N", "noise_NA"])
+@pytest.mark.parametrize("name", ["prepared_NE", "costly_ND", "query_NM", "noise_NA"])
 def test_every_input_of_a_memoryless_action_graph_matters(memoryless: Bundle, name: str) -> None:
-    policy, feed = Policy(memoryless), inputs(memoryless, 2)
-    before = act(policy, feed)
-    assert [array.size for array in before] == [2 * memoryless.manifest.action.size, 0, 0, 0]
-    assert before.finite_N.tolist() == [True, True]
-    changed = ~feed[name] if name == "query_NM" else feed[name] + 1
-    assert np.abs(act(policy, {**feed, name: changed}).action_NA - before.action_NA).max() > 1e-3
+    policy, batch = Policy(memoryless), batch_of(memoryless, 2)
+    before = acted(policy, batch)
+    assert [array.size for array in before] == [2 * memoryless.manifest.action.size, 0, 0]
+    assert batch.is_finite
+    assert batch.finite_N.tolist() == [True, True]
+    array = getattr(batch, name)
+    array[...] = 1.0 - array if name == "query_NM" else array + 1
+    assert np.abs(acted(policy, batch)[0] - before[0]).max() > 1e-3
 
 
-@pytest.mark.parametrize("name", ["hidden", "free", "returns_to_go", "target_cost"])
-def test_every_input_of_the_acquisition_graph_matters(conditioned: Bundle, name: str) -> None:
-    policy, manifest = Policy(conditioned), conditioned.manifest
-    feed = [np.ones((1, manifest.width)), np.ones((1, manifest.features.n_free)), np.ones(1), np.zeros(1)]
-    before = policy.query_probs(*feed)
-    feed[["hidden", "free", "returns_to_go", "target_cost"].index(name)] += 1.0
-    assert before.shape == (1, manifest.features.n_queries)
-    assert np.abs(policy.query_probs(*feed) - before).max() > 1e-3
+@pytest.mark.parametrize("output", ["probs_NM", "asked_NE"])
+@pytest.mark.parametrize("name", ["past_NW", "free_NF", "left_N1", "target_cost_N1"])
+def test_every_input_of_the_acquisition_graph_matters(conditioned: Bundle, name: str, output: str) -> None:
+    policy, batch = Policy(conditioned), batch_of(conditioned, 2)
+    policy.query_probs(batch)
+    before = getattr(batch, output).copy()
+    getattr(batch, name)[...] += 1.0
+    policy.query_probs(batch)
+    changed = np.abs(getattr(batch, output) - before).max() > 1e-3
+    assert changed == (name != "target_cost_N1" or output == "probs_NM")

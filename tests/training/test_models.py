@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from tests.training.test_acquisition import M, batch, know, network
-from training.graphs import AcquisitionGraph, ActionGraph
 from training.models import BudgetedDecisionTransformer
 
 
@@ -50,36 +49,6 @@ def test_a_frame_is_felt_for_exactly_layers_times_span(context_length: int, n_la
     reach = n_layers * (context_length - 1)
     assert felt[: reach + 1].all()
     assert not felt[reach + 1 :].any()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_incremental_equals_windowed_over_an_episode_longer_than_the_span(seed: int) -> None:
-    model = network(seed)
-    config, length, n = model.config, 23, 2
-    slots, head = config.context_length - 1, config.width // config.n_heads
-    free, costly, togo, uniforms, _ = batch(seed, n, length)
-    query = (uniforms < 0.5).float()
-    windowed = hidden_states(model, free, costly, togo, query)
-    known = know(model, free, costly, togo)
-    probs = model.query_probs(model.memory(windowed), known)
-    keys = torch.zeros(config.n_layers, n, config.n_heads, slots, head)
-    values = torch.full_like(keys, 9.0)  # an empty slot's contents must not matter
-    ages = torch.full((n, slots), config.context_length)
-    hidden = torch.zeros(n, config.width)
-    noise = torch.rand(n, length, 2)
-    acquisition, action = AcquisitionGraph(model), ActionGraph(model)
-    for t in range(length):
-        target = known.target_cost[:, t]
-        assert torch.allclose(acquisition(free[:, t], togo[:, t], hidden, target), probs[:, t], atol=1e-5)
-        actions, hidden, new_keys, new_values = action(
-            free[:, t], costly[:, t], query[:, t], togo[:, t], noise[:, t], keys, values, ages
-        )
-        assert torch.allclose(hidden, windowed[:, t], atol=1e-5)
-        assert torch.allclose(actions, model.action_head.actions(windowed[:, t], noise[:, t]))
-        slot = t % slots
-        keys[:, :, :, slot], values[:, :, :, slot] = new_keys, new_values
-        ages = (ages + 1).clamp(max=config.context_length)
-        ages[:, slot] = 1
 
 
 def test_sampled_component_follows_its_probabilities() -> None:

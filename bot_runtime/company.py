@@ -1,0 +1,96 @@
+"""Companies: the bots that are named together, again and again, and what is worked out for them only once.
+
+This module knows nothing about messages or turns' contents. An engine names the same bots in the same order frame after
+frame; all that depends on nothing else is kept with them: their slots, their batch, what they may spend.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bot_runtime.batch import Batch
+from bot_runtime.context import Contexts
+from bot_runtime.slots import Slots
+from bot_runtime.spending import Limits, Spending, Terms
+
+if TYPE_CHECKING:  # a turn is a company's, and a company remembers its last turn
+    from bot_runtime.turns import Turn
+
+__all__ = ["MAX_COMPANIES", "Companies", "Company", "Means"]
+
+MAX_COMPANIES = 256  # a few kB each; an engine that names its bots in ever new orders pushes out the oldest
+# Bots whose cost stays this far below their budgets need no allocation, whatever margin allocation keeps back.
+_AMPLE = 1.0 - 1e-9
+_Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Means:
+    """What counts for N bots in one frame, and what they may spend without a second look."""
+
+    terms: Terms
+    ample_N: _Floats
+    calls_cost: bool  # whether any call does
+
+    @classmethod
+    def of(cls, terms: Terms) -> Means:
+        """What follows from a frame's terms."""
+        return cls(terms, terms.budgets_N * _AMPLE, bool(terms.calls_N.any()))
+
+    def cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
+        """Predicted µs of each bot's query, shape [N]."""
+        cost_us_N: _Floats = np.add.reduce(np.multiply(self.terms.costs_NM, query_NM), axis=1)
+        if self.calls_cost:
+            cost_us_N += np.where(query_NM.any(axis=1), self.terms.calls_N, 0.0)
+        return cost_us_N
+
+
+@dataclass(eq=False)
+class Company:
+    """N bots in one order. `turn` is the last one that they began together, be it over or left by some of them."""
+
+    handles_N: NDArray[np.int64]
+    batch: Batch
+    means: Means  # where a frame says nothing of budgets
+    turn: Turn | None = None
+
+    @property
+    def slots_N(self) -> NDArray[np.int64]:
+        """Their rows of the arena, shape [N]."""
+        return self.batch.slots_N
+
+    @property
+    def n_bots(self) -> int:
+        """N."""
+        return self.batch.n_bots
+
+
+class Companies:
+    """The companies that were named last, by their handles."""
+
+    def __init__(self, slots: Slots, contexts: Contexts, spending: Spending) -> None:
+        self._slots, self._contexts, self._spending = slots, contexts, spending
+        self._known: dict[bytes, Company] = {}
+
+    def named(self, handles_N: NDArray[np.int64], unsaid: Limits) -> Company:
+        """The company of these bots; `unsaid` are limits that say nothing. Raises what `Slots.resolve` raises."""
+        key = handles_N.tobytes()
+        company = self._known.get(key)
+        if company is not None and handles_N.dtype == np.int64 and handles_N.ndim == 1:
+            return company
+        slots_N = self._slots.resolve(handles_N)
+        means = Means.of(self._spending.terms(slots_N, unsaid))
+        company = Company(handles_N.copy(), self._contexts.batch(slots_N), means)
+        if len(self._known) == MAX_COMPANIES:
+            del self._known[next(iter(self._known))]
+        self._known[key] = company
+        return company
+
+    def forget(self, slots_N: NDArray[np.int64]) -> None:
+        """Forget every company that one of these was in."""
+        gone = set(slots_N.tolist())
+        self._known = {key: each for key, each in self._known.items() if gone.isdisjoint(each.slots_N.tolist())}
