@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from bot_runtime import inputs
 from bot_runtime.batch import Batch
-from bot_runtime.budget import allocate
 from bot_runtime.bundle import Bundle
 from bot_runtime.company import Companies, Company, Means
 from bot_runtime.context import Contexts
@@ -215,10 +214,7 @@ class Bots:
         if np.count_nonzero(finite_NM) < finite_NM.size:
             asks_N = np.logical_and.reduce(finite_NM, axis=1)
             query_NM &= asks_N[:, None]
-        cost_us_N = means.cost_us(query_NM)
-        if frame_budget_us is not None or np.count_nonzero(cost_us_N <= means.ample_N) < batch.n_bots:
-            query_NM = allocate(probs_NM, query_NM, *means.terms[:3], frame_budget_us)
-            cost_us_N = means.cost_us(query_NM)
+        query_NM, cost_us_N = means.fit(probs_NM, query_NM, frame_budget_us)
         _freeze(query_NM, cost_us_N, probs_NM)
         queries = Queries(frame, query_NM, cost_us_N, probs_NM, infer_us)
         return Turn(frame, company.handles_N, request, queries, noise[:, n_queries:], asks_N)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bot_runtime.batch import Batch
+from bot_runtime.budget import allocate
 from bot_runtime.context import Contexts
 from bot_runtime.slots import Slots
 from bot_runtime.spending import Limits, Spending, Terms
@@ -35,15 +36,33 @@ class Means:
     terms: Terms
     ample_N: _Floats
     calls_cost: bool  # whether any call does
+    room_NM: _Floats  # for what `fit` computes on the way
 
     @classmethod
     def of(cls, terms: Terms) -> Means:
         """What follows from a frame's terms."""
-        return cls(terms, terms.budgets_N * _AMPLE, bool(terms.calls_N.any()))
+        return cls(terms, terms.budgets_N * _AMPLE, bool(terms.calls_N.any()), np.empty_like(terms.costs_NM))
 
-    def cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
-        """Predicted µs of each bot's query, shape [N]."""
-        cost_us_N: _Floats = np.add.reduce(np.multiply(self.terms.costs_NM, query_NM), axis=1)
+    def fit(
+        self, probs_NM: NDArray[np.float32], sampled_NM: NDArray[np.bool_], frame_budget_us: float | None
+    ) -> tuple[NDArray[np.bool_], _Floats]:
+        """What `allocate` leaves of the sampled queries, [N, M], and its predicted µs, [N]. Changes `sampled_NM`.
+
+        Most frames need no allocation; without a shared budget no other bots than those that sampled too much do.
+        """
+        terms, cost_us_N = self.terms, self._cost_us(sampled_NM)
+        fits_N = cost_us_N <= self.ample_N
+        if frame_budget_us is not None:
+            query_NM = allocate(probs_NM, sampled_NM, *terms[:3], frame_budget_us)
+        elif np.count_nonzero(fits_N) == fits_N.size:
+            return sampled_NM, cost_us_N
+        else:
+            rows, query_NM = np.flatnonzero(~fits_N), sampled_NM
+            query_NM[rows] = allocate(probs_NM[rows], sampled_NM[rows], *(numbers[rows] for numbers in terms[:3]))
+        return query_NM, self._cost_us(query_NM)
+
+    def _cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
+        cost_us_N: _Floats = np.add.reduce(np.multiply(self.terms.costs_NM, query_NM, out=self.room_NM), axis=1)
         if self.calls_cost:
             cost_us_N += np.where(query_NM.any(axis=1), self.terms.calls_N, 0.0)
         return cost_us_N

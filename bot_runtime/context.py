@@ -96,7 +96,8 @@ class Contexts:
             place_N.fill(self._after(first))
             np.copyto(batch.past_NW, batch.hidden_NW)
         self._last_action_BA[batch.at] = action_NA
-        self._turns_B[batch.at] += 1
+        turns_N = self._turns_B[batch.at]  # a view: the rows lie side by side
+        turns_N += 1
 
     def _advance_some(self, batch: Batch, action_NA: _Floats, kept: _Ints) -> None:
         """The same in any order and of any of the batch's rows."""

@@ -6,7 +6,6 @@ its request is refused with the bot, the feature, what was expected and what cam
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -66,9 +65,9 @@ class FeatureChecks:
         self._free_range, self._costly_range, self._owner = table.free_range, table.costly_range, table.owner
         low, high = self._costly_range
         self._zero_is_legal = bool((low <= 0.0).all() and (high >= 0.0).all())
-        shape = (capacity, max(table.n_free, table.n_costly))
-        self._legal, self._low_enough = np.empty((2, math.prod(shape)), dtype=np.bool_)
         self._known = np.empty((capacity, table.n_costly), dtype=np.bool_)
+        self._room = np.empty((2, capacity * max(table.n_free, table.n_costly)), dtype=np.bool_)
+        self._rooms: dict[tuple[int, ...], tuple[_Bools, _Bools]] = {}  # parts of it by shape
 
     def free(self, free_NF: _Floats, handles_N: NDArray[np.int64]) -> None:
         """Raises BadShape, NonFinite or OutOfRange unless these are legal free numbers of these bots."""
@@ -110,10 +109,14 @@ class FeatureChecks:
 
     def _within(self, numbers: _Floats, limits: tuple[_Floats, _Floats]) -> bool:
         """Whether all are; not where one is NaN."""
-        legal, low_enough = (room[: numbers.size].reshape(numbers.shape) for room in (self._legal, self._low_enough))
-        np.greater_equal(numbers, limits[0], out=legal)
+        shape = numbers.shape
+        if shape not in self._rooms:
+            first, second = (room[: numbers.size].reshape(shape) for room in self._room)
+            self._rooms[shape] = (first, second)
+        high_enough, low_enough = self._rooms[shape]
+        np.greater_equal(numbers, limits[0], out=high_enough)
         np.less_equal(numbers, limits[1], out=low_enough)
-        return int(np.count_nonzero(np.logical_and(legal, low_enough, out=legal))) == numbers.size
+        return int(np.count_nonzero(np.logical_and(high_enough, low_enough, out=low_enough))) == numbers.size
 
 
 def _check_answered(

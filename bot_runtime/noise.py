@@ -20,9 +20,13 @@ _AHEAD = 16  # turns of one bot; fewer of more bots
 
 def mix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """SplitMix64's output function of each element, any shape."""
-    state = (state ^ (state >> np.uint64(30))) * _MIX_1
-    state = (state ^ (state >> np.uint64(27))) * _MIX_2
-    return state ^ (state >> np.uint64(31))
+    mixed = state >> np.uint64(30)
+    mixed ^= state
+    mixed *= _MIX_1
+    mixed ^= mixed >> np.uint64(27)
+    mixed *= _MIX_2
+    mixed ^= mixed >> np.uint64(31)
+    return mixed
 
 
 def uniforms(seeds_N: NDArray[np.uint64], turns_N: NDArray[np.int64], count: int) -> NDArray[np.float32]:
@@ -34,7 +38,10 @@ def uniforms(seeds_N: NDArray[np.uint64], turns_N: NDArray[np.int64], count: int
     rows_N = mix(streams_N + np.asarray(turns_N).astype(np.uint64) * _GOLDEN)
     indices = np.arange(1, count + 1, dtype=np.uint64) * _GOLDEN
     bits = mix(rows_N[:, None] + indices[None, :])
-    return (bits >> np.uint64(40)).astype(np.float32) * _FLOAT32_STEP
+    bits >>= np.uint64(40)
+    numbers = bits.astype(np.float32)
+    numbers *= _FLOAT32_STEP
+    return numbers
 
 
 class Noise:
