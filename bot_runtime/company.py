@@ -53,12 +53,14 @@ class Means:
         terms, cost_us_N = self.terms, self._cost_us(sampled_NM)
         fits_N = cost_us_N <= self.ample_N
         if frame_budget_us is not None:
-            query_NM = allocate(probs_NM, sampled_NM, *terms[:3], frame_budget_us)
+            costs, calls, budgets = terms.costs_NM, terms.calls_N, terms.budgets_N
+            query_NM = allocate(probs_NM, sampled_NM, costs, calls, budgets, frame_budget_us)
         elif np.count_nonzero(fits_N) == fits_N.size:
             return sampled_NM, cost_us_N
         else:
             rows, query_NM = np.flatnonzero(~fits_N), sampled_NM
-            query_NM[rows] = allocate(probs_NM[rows], sampled_NM[rows], *(numbers[rows] for numbers in terms[:3]))
+            costs, calls, budgets = terms.costs_NM[rows], terms.calls_N[rows], terms.budgets_N[rows]
+            query_NM[rows] = allocate(probs_NM[rows], sampled_NM[rows], costs, calls, budgets)
         return query_NM, self._cost_us(query_NM)
 
     def _cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
