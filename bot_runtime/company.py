@@ -24,8 +24,8 @@ if TYPE_CHECKING:  # a turn is a company's, and a company remembers its last tur
 __all__ = ["MAX_COMPANIES", "Companies", "Company", "Means"]
 
 MAX_COMPANIES = 256  # a few kB each; an engine that names its bots in ever new orders pushes out the oldest
-# Bots whose cost stays this far below their budgets need no allocation, whatever margin allocation keeps back.
-_AMPLE = 1.0 - 1e-9
+# What stays this far below a budget needs no allocation, for allocation keeps back less than that of it.
+_AMPLE = 1.0 - 1e-6
 _Floats = NDArray[np.float64]
 
 
@@ -50,17 +50,17 @@ class Means:
 
         Most frames need no allocation; without a shared budget no other bots than those that sampled too much do.
         """
-        terms, cost_us_N = self.terms, self._cost_us(sampled_NM)
+        costs_NM, calls_N, budgets_N = self.terms[:3]
+        query_NM, cost_us_N = sampled_NM, self._cost_us(sampled_NM)
         fits_N = cost_us_N <= self.ample_N
-        if frame_budget_us is not None:
-            costs, calls, budgets = terms.costs_NM, terms.calls_N, terms.budgets_N
-            query_NM = allocate(probs_NM, sampled_NM, costs, calls, budgets, frame_budget_us)
-        elif np.count_nonzero(fits_N) == fits_N.size:
-            return sampled_NM, cost_us_N
-        else:
-            rows, query_NM = np.flatnonzero(~fits_N), sampled_NM
-            costs, calls, budgets = terms.costs_NM[rows], terms.calls_N[rows], terms.budgets_N[rows]
-            query_NM[rows] = allocate(probs_NM[rows], sampled_NM[rows], costs, calls, budgets)
+        if frame_budget_us is None:
+            rows = np.flatnonzero(~fits_N)
+            if rows.size == 0:
+                return query_NM, cost_us_N
+            rest = (costs_NM[rows], calls_N[rows], budgets_N[rows])
+            query_NM[rows] = allocate(probs_NM[rows], sampled_NM[rows], *rest)
+        elif not (fits_N.all() and cost_us_N.sum() <= frame_budget_us * _AMPLE):
+            query_NM = allocate(probs_NM, sampled_NM, costs_NM, calls_N, budgets_N, frame_budget_us)
         return query_NM, self._cost_us(query_NM)
 
     def _cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
