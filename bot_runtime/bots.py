@@ -17,6 +17,7 @@ from bot_runtime import inputs
 from bot_runtime.budget import allocate
 from bot_runtime.bundle import Bundle
 from bot_runtime.context import Contexts
+from bot_runtime.costs import MAX_ACQUIRE_US, Costs
 from bot_runtime.fallback import Counters, fallback_actions
 from bot_runtime.noise import uniforms
 from bot_runtime.policy import Policy, Step
@@ -115,12 +116,14 @@ class Bots:
         frame_budget_us: float | None = None,
         budgets_us: _Numbers = None,
         target_costs_us: _Numbers = None,
+        costs: Costs | None = None,
     ) -> Queries:
         """What each bot asks for in this frame, within its own budget and, together, within `frame_budget_us`.
 
         `rewards_N` came since each bot's last frame and leave its return-to-go, once. `budgets_us` and
         `target_costs_us`, one number a bot, replace those of the bots' start for this frame only; how they make the
-        network's target cost is `Spending.terms`. A newer frame abandons a pending query. Raises BadShape, BadSchema,
+        network's target cost is `Spending.terms`. `costs`, as the bots' engine measures them, replace those of their
+        start for this frame. A newer frame abandons a pending query. Raises BadShape, BadSchema,
         NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
         """
         slots_N = self._slots.resolve(handles)
@@ -135,7 +138,7 @@ class Bots:
             _check_same(request, retried.request, frame)
             return retried.queries
         returns_to_go_N = self._contexts.returns_to_go(slots_N) - rewards_N
-        turn = self._ask(handles, slots_N, frame, request, returns_to_go_N.astype(np.float32), limits)
+        turn = self._ask(handles, slots_N, frame, request, returns_to_go_N.astype(np.float32), limits, costs)
         self._contexts.spend(slots_N, returns_to_go_N)
         self._turns.begin(slots_N, turn)
         return turn.queries
@@ -147,10 +150,13 @@ class Bots:
         acquired_NM: NDArray[np.bool_],
         costly_ND: NDArray[np.float32],
         failed_NM: NDArray[np.bool_] | None = None,
+        acquire_us: float | None = None,
+        costs: Costs | None = None,
     ) -> Actions:
         """Answer the pending query of exactly these bots, in its order, and get their actions.
 
         `costly_ND` is dense; numbers of features that were not acquired, or are marked failed, are never looked at.
+        `acquire_us` is what acquiring took for all of these bots; `costs` learn from it, once a turn.
         Raises BadShape, BadSchema, NoBot, StaleFrame, NoPendingQuery, UnrequestedFeature, MissingFeature, NonFinite,
         OutOfRange, FrameReused.
         """
@@ -158,13 +164,17 @@ class Bots:
         check_frame(frame)
         turn = self._turns.features(handles, slots_N, frame)
         table, query_NM = self.bundle.manifest.features, turn.queries.query_NM
-        acquired_NM, known_ND = inputs.check_features(acquired_NM, costly_ND, failed_NM, query_NM, handles, table)
-        submission = (acquired_NM, known_ND)
+        known_NM, known_ND = inputs.check_features(acquired_NM, costly_ND, failed_NM, query_NM, handles, table)
+        measured = () if acquire_us is None else (acquire_us,)
+        measured_us = inputs.per_bot("acquire_us", measured, len(measured), 0.0, MAX_ACQUIRE_US)
+        submission = (known_NM, known_ND, measured_us)
         if turn.actions is not None:
             _check_same(submission, turn.submission, frame)
             return turn.actions
-        actions = self._act(turn, slots_N, acquired_NM, known_ND)
+        actions = self._act(turn, slots_N, known_NM, known_ND)
         turn.submission, turn.actions = submission, actions
+        if acquire_us is not None and costs is not None:
+            costs.observe(acquired_NM, acquire_us)
         return actions
 
     def stop(self, handles: _Handles) -> int:
@@ -187,11 +197,12 @@ class Bots:
         request: tuple[NDArray[np.generic], ...],
         returns_to_go_N: NDArray[np.float32],
         limits: Limits,
+        costs: Costs | None,
     ) -> Turn:
         """Compute a turn's first half without changing any bot."""
         manifest, free_NF = self.bundle.manifest, request[0].astype(np.float32, copy=False)
         n_queries, hidden_NW = manifest.features.n_queries, self._contexts.hidden(slots_N)
-        costs_NM, calls_N, budgets_N, target_cost_N = self._spending.terms(slots_N, limits)
+        costs_NM, calls_N, budgets_N, target_cost_N = self._spending.terms(slots_N, limits, costs)
         started_ns = self._clock()
         probs_NM = self._policy.query_probs(hidden_NW, free_NF, returns_to_go_N, target_cost_N)
         infer_us = (self._clock() - started_ns) / 1e3
