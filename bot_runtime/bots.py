@@ -18,6 +18,7 @@ from bot_runtime.batch import Batch
 from bot_runtime.bundle import Bundle
 from bot_runtime.company import Companies, Company, Means
 from bot_runtime.context import Contexts
+from bot_runtime.costs import MAX_ACQUIRE_US, Costs
 from bot_runtime.fallback import Counters, fallback_actions
 from bot_runtime.policy import Policy
 from bot_runtime.slots import Slots
@@ -118,12 +119,14 @@ class Bots:
         frame_budget_us: float | None = None,
         budgets_us: _Numbers = None,
         target_costs_us: _Numbers = None,
+        costs: Costs | None = None,
     ) -> Queries:
         """What each bot asks for in this frame, within its own budget and, together, within `frame_budget_us`.
 
         `rewards_N` came since each bot's last frame and leave its return-to-go, once. `budgets_us` and
         `target_costs_us`, one number a bot, replace those of the bots' start for this frame only; how they make the
-        network's target cost is `Spending.terms`. A newer frame abandons a pending query. Raises BadShape, BadSchema,
+        network's target cost is `Spending.terms`. `costs`, as the bots' engine measures them, replace those of their
+        start for this frame. A newer frame abandons a pending query. Raises BadShape, BadSchema,
         NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
         """
         company = self._companies.named(handles, _NOTHING_SAID)
@@ -135,9 +138,9 @@ class Bots:
         else:
             rewards_N = inputs.per_bot("rewards", rewards_N, company.n_bots, -MAX_RETURN, MAX_RETURN)
         limits, means = _NOTHING_SAID, company.means
-        if budgets_us is not None or target_costs_us is not None or frame_budget_us is not None:
+        if any(said is not None for said in (budgets_us, target_costs_us, frame_budget_us, costs)):
             limits = Limits.checked(company.n_bots, budgets_us, target_costs_us, frame_budget_us)
-            means = Means.of(self._spending.terms(company.slots_N, limits))
+            means = Means.of(self._spending.terms(company.slots_N, limits, costs))
         request = (free_NF.copy(), rewards_N, *limits)
         if retried is not None:
             _check_same(request, retried.request, frame)
@@ -156,10 +159,13 @@ class Bots:
         acquired_NM: NDArray[np.bool_],
         costly_ND: NDArray[np.float32],
         failed_NM: NDArray[np.bool_] | None = None,
+        acquire_us: float | None = None,
+        costs: Costs | None = None,
     ) -> Actions:
         """Answer the pending query of exactly these bots, in its order, and get their actions.
 
         `costly_ND` is dense; numbers of features that were not acquired, or are marked failed, are never looked at.
+        `acquire_us` is what acquiring took for all of these bots; `costs` learn from it, once a turn.
         Raises BadShape, BadSchema, NoBot, StaleFrame, NoPendingQuery, UnrequestedFeature, MissingFeature, NonFinite,
         OutOfRange, FrameReused.
         """
@@ -169,12 +175,17 @@ class Bots:
         staged_ND = batch.costly_ND if turn.actions is None else np.empty_like(batch.costly_ND)
         query_NM = turn.queries.query_NM
         known_NM = self._checks.costly(acquired_NM, costly_ND, failed_NM, query_NM, handles, staged_ND)
+        measured = () if acquire_us is None else (acquire_us,)
+        measured_us = inputs.per_bot("acquire_us", measured, len(measured), 0.0, MAX_ACQUIRE_US)
         if turn.actions is not None:
-            _check_same((staged_ND, known_NM), self._contexts.acquired(batch), frame)
+            kept = (*self._contexts.acquired(batch), turn.measured_us)
+            _check_same((staged_ND, known_NM, measured_us), kept, frame)
             return turn.actions
         np.copyto(batch.query_NM, known_NM)
-        turn.actions = self._act(turn, batch)
+        turn.actions, turn.measured_us = self._act(turn, batch), measured_us
         batch.keep_acquired()
+        if acquire_us is not None and costs is not None:
+            costs.observe(acquired_NM, acquire_us)
         return turn.actions
 
     def stop(self, handles: _Handles) -> int:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bot_runtime.costs import Costs
 from bot_runtime.inputs import per_bot
 from bot_runtime.manifest import Manifest
 from protocol.features import CostModel
@@ -88,8 +89,8 @@ class Spending:
         for array in (self._costs_BM, self._calls_B, self._full_B, self._budgets_B, self._targets_B):
             array[slots_N] = 0.0
 
-    def terms(self, slots_N: NDArray[np.int64], said: Limits) -> Terms:
-        """What counts in a frame whose request says this.
+    def terms(self, slots_N: NDArray[np.int64], said: Limits, measured: Costs | None = None) -> Terms:
+        """What counts in a frame whose request says this. Where costs were measured, they replace the rows' own.
 
         The target cost is the first of: the frame's target cost, the frame's budget, the start's target cost, the
         start's budget, the bundle's default; and never more than the bot may spend, be it the budget in force or an
@@ -97,14 +98,18 @@ class Spending:
         read it, it is 0, for those few µs count in every frame.
         """
         budgets_N = said.budgets_N if said.budgets_N.size else self._budgets_B[slots_N]
-        share_N = self._shares(slots_N, said, budgets_N) if self._is_conditioned else np.zeros(slots_N.size)
-        return Terms(self._costs_BM[slots_N], self._calls_B[slots_N], budgets_N, share_N.astype(np.float32))
+        if measured is None:
+            costs_NM, calls_N, full_N = self._costs_BM[slots_N], self._calls_B[slots_N], self._full_B[slots_N]
+        else:
+            costs_NM = np.repeat(measured.costs_M[None], slots_N.size, axis=0)
+            calls_N, full_N = np.full(slots_N.size, measured.call_us), np.full(slots_N.size, measured.full_us)
+        share_N = self._shares(slots_N, said, budgets_N, full_N) if self._is_conditioned else np.zeros(slots_N.size)
+        return Terms(costs_NM, calls_N, budgets_N, share_N.astype(np.float32))
 
-    def _shares(self, slots_N: NDArray[np.int64], said: Limits, budgets_N: _Floats) -> _Floats:
+    def _shares(self, slots_N: NDArray[np.int64], said: Limits, budgets_N: _Floats, full_N: _Floats) -> _Floats:
         target_us_N = np.minimum(_first(said.targets_N, said.budgets_N, self._targets_B[slots_N]), budgets_N)
         if said.shared_1.size:
             target_us_N = np.minimum(target_us_N, said.shared_1 / slots_N.size)
-        full_N = self._full_B[slots_N]
         return np.divide(np.minimum(target_us_N, full_N), full_N, out=np.ones_like(full_N), where=full_N > 0.0)
 
 

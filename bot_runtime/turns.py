@@ -6,7 +6,7 @@ module applies it to the bots of one message at once and keeps what a retry has 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from protocol.errors import FrameReused, NoPendingQuery
 from protocol.turn import Event, Phase, is_retry, transition
 
 __all__ = ["Actions", "Queries", "Turn", "Turns"]
+
 
 _NONE = 0  # the turn id of a bot that has had no turn
 _Ints = NDArray[np.int64]
@@ -53,6 +54,9 @@ class Turn:
     noise_NA: NDArray[np.float32]
     asks_N: NDArray[np.bool_] | None  # whose query_probs were finite; None: everyone's
     actions: Actions | None = None
+    measured_us: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros(0)
+    )  # what acquiring took, [1], where the engine says so
     key: int = _NONE  # in `Turns`
     members: int = 0  # how many of its bots have begun no other turn since, and are still there
 

@@ -98,12 +98,19 @@ class BotClient:
         return read_queries(self._framed(message), len(handles), table)
 
     def act(
-        self, bots: ArrayLike, frame: int, acquired: ArrayLike, costly: ArrayLike, failed: ArrayLike | None = None
+        self,
+        bots: ArrayLike,
+        frame: int,
+        acquired: ArrayLike,
+        costly: ArrayLike,
+        failed: ArrayLike | None = None,
+        acquire_us: float | None = None,
     ) -> Actions:
         """Answer the pending query of the same bots and frame, and get their actions.
 
         `acquired` and `failed` are bool [N, M], together exactly what was asked for; `costly` is [N, D], of which only
-        the acquired numbers are read and sent. Raises BadShape locally too.
+        the acquired numbers are read and sent. `acquire_us` is what acquiring all of this took: the server then keeps
+        budgets by what it measures, if its welcome has a `cost_quantile`. Raises BadShape locally too.
         """
         welcome = self._connected()
         table = welcome.features
@@ -115,6 +122,8 @@ class BotClient:
         message["values"] = costly_ND[np.repeat(acquired_NM, table.sizes, axis=1)].tobytes()
         if failed is not None:
             message["failed"] = _pack_bits(_matrix(failed, "?", acquired_NM.shape, "failed"))
+        if acquire_us is not None:
+            message["acquire_us"] = float(acquire_us)
         return read_actions(self._framed(message), len(handles), welcome.action)
 
     def stop(self, bots: ArrayLike) -> int:

@@ -71,6 +71,8 @@ class Welcome(_Message, frozen=True, tag="welcome"):
     """The connection's name, what is served, what it costs and every limit.
 
     `budget_us` is a bot's default budget, `target_cost_us` its default target cost, null where the bundle has none.
+    `cost_quantile` is how often acquiring is to take no longer than predicted, once it is measured; null where a
+    server takes no measurements.
     """
 
     connection: str
@@ -83,6 +85,7 @@ class Welcome(_Message, frozen=True, tag="welcome"):
     max_bots: int
     max_body_bytes: int
     target_cost_us: float | None = None
+    cost_quantile: float | None = None
 
 
 class StartBots(_Message, frozen=True, tag="start_bots"):
@@ -130,7 +133,8 @@ class SubmitFeatures(_Message, frozen=True, tag="submit_features"):
     """What was acquired for the pending queries of the same bots in the same order.
 
     `acquired` and `failed` are bits [N, M]. `values` is ragged: for each bot in order, for each acquired feature in
-    order, its `size` numbers (float32 little-endian bytes, or one list a bot).
+    order, its `size` numbers (float32 little-endian bytes, or one list a bot). `acquire_us` is what acquiring all of
+    this took, as the engine measured it.
     """
 
     frame: _Frame
@@ -138,6 +142,7 @@ class SubmitFeatures(_Message, frozen=True, tag="submit_features"):
     acquired: Bits
     values: Blob
     failed: Bits | None = None
+    acquire_us: float | None = None
 
 
 class Actions(_Message, frozen=True, tag="actions"):

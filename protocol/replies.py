@@ -34,7 +34,8 @@ _REPLY_TO = {
 class Welcome(NamedTuple):
     """What the server answers to hello: its bundle's features, action, costs and limits.
 
-    `target_cost_us` is None where the bundle is not conditioned on its budget, and from a server without that field.
+    `target_cost_us` is None where the bundle is not conditioned on its budget, and `cost_quantile` where the server
+    takes no measurements; both from a server that is older than the field.
     """
 
     connection: str
@@ -47,6 +48,7 @@ class Welcome(NamedTuple):
     max_bots: int
     max_body_bytes: int
     target_cost_us: float | None = None
+    cost_quantile: float | None = None
 
 
 class Queries(NamedTuple):
@@ -82,7 +84,7 @@ def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
 def read_welcome(reply: dict[str, Any]) -> Welcome:
     """The fields of a `welcome`; raises ReplyError."""
     with _reading("hello"):
-        target_cost_us = reply.get("target_cost_us")
+        target_cost_us, cost_quantile = reply.get("target_cost_us"), reply.get("cost_quantile")
         return Welcome(
             connection=str(reply["connection"]),
             bundle=str(reply["bundle"]),
@@ -96,6 +98,7 @@ def read_welcome(reply: dict[str, Any]) -> Welcome:
             max_bots=int(reply["max_bots"]),
             max_body_bytes=int(reply["max_body_bytes"]),
             target_cost_us=None if target_cost_us is None else float(target_cost_us),
+            cost_quantile=None if cost_quantile is None else float(cost_quantile),
         )
 
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+from bot_runtime.costs import Costs
 from protocol.errors import NoBot, NoConnection, TooManyConnections
 from protocol.features import CostModel
 
@@ -18,10 +19,10 @@ __all__ = ["Connection", "Connections"]
 
 @dataclass(eq=False)
 class Connection:
-    """One engine's link to the server; it alone may name its bots."""
+    """One engine's link to the server; it alone may name its bots. `costs` are as it declared, then as it measures."""
 
     id: str
-    cost_model: CostModel
+    costs: Costs
     last_seen_s: float
     bots: set[int] = field(default_factory=set)
 
@@ -44,11 +45,14 @@ class Connections:
     def __len__(self) -> int:
         return len(self._by_id)
 
+    def __iter__(self) -> Iterator[Connection]:
+        return iter(self._by_id.values())
+
     def open(self, cost_model: CostModel) -> Connection:
         """A new connection; raises TooManyConnections."""
         if len(self._by_id) >= self._max_connections:
             raise TooManyConnections(f"all {self._max_connections} connections are taken", retry_after_s=1.0)
-        connection = Connection(secrets.token_hex(16), cost_model, self._clock())
+        connection = Connection(secrets.token_hex(16), Costs(cost_model), self._clock())
         self._by_id[connection.id] = connection
         return connection
 

@@ -11,6 +11,7 @@ import hmac
 import numpy as np
 
 from bot_runtime.bots import Bots
+from bot_runtime.costs import Report
 from bot_runtime.inputs import check_costs
 from protocol import arrays
 from protocol.codec import Format, body_limit
@@ -78,6 +79,10 @@ class Handlers:
         for connection in self._connections.remove_silent():
             self._stop(connection, list(connection.bots))
 
+    def costs(self) -> list[Report]:
+        """What acquiring costs each connection's engine, in the order in which they connected."""
+        return [connection.costs.report() for connection in self._connections]
+
     def check_token(self, token: str | None) -> None:
         """Raise Unauthorized unless this is the server's token, or it has none. Takes equally long either way."""
         if self._token is None:
@@ -96,8 +101,9 @@ class Handlers:
         self.end_silent()
         budget_us = cost_model.full_us if self._manifest.is_unlimited else self._manifest.budget_us
         target_cost = self._manifest.target_cost
+        connection = self._connections.open(cost_model)
         return Welcome(
-            connection=self._connections.open(cost_model).id,
+            connection=connection.id,
             bundle=self._manifest.name,
             features=self._table,
             action=self._manifest.action,
@@ -107,6 +113,7 @@ class Handlers:
             max_bots=self._bots.max_bots,
             max_body_bytes=self.max_body_bytes[form],
             target_cost_us=None if target_cost is None else target_cost * cost_model.full_us,
+            cost_quantile=connection.costs.quantile,
         )
 
     def _start_bots(self, request: StartBots, connection: Connection) -> BotsStarted:
@@ -116,7 +123,7 @@ class Handlers:
             target_returns=request.target_returns,
             budgets_us=request.budgets_us,
             target_costs_us=request.target_costs_us,
-            cost_model=connection.cost_model,
+            cost_model=connection.costs.declared,
         ).tolist()
         connection.bots.update(handles)
         return BotsStarted(bots=handles)
@@ -133,6 +140,7 @@ class Handlers:
             request.frame_budget_us,
             request.budgets_us,
             request.target_costs_us,
+            connection.costs,
         )
         queries = arrays.pack_bits(turn.query_NM, form)
         return Queries(frame=turn.frame, queries=queries, cost_us=turn.cost_us_N.tolist(), infer_us=turn.infer_us)
@@ -144,7 +152,9 @@ class Handlers:
         failed_NM = None if request.failed is None else arrays.bits(request.failed, shape, "failed")
         costly_ND = arrays.unpack_values(request.values, acquired_NM, self._table)
         handles_N = np.array(request.bots, dtype=np.int64)
-        turn = self._bots.submit_features(handles_N, request.frame, acquired_NM, costly_ND, failed_NM)
+        turn = self._bots.submit_features(
+            handles_N, request.frame, acquired_NM, costly_ND, failed_NM, request.acquire_us, connection.costs
+        )
         actions = arrays.pack_floats(turn.action_NA, form)
         return Actions(frame=turn.frame, actions=actions, reasons=turn.reasons_N.tolist(), infer_us=turn.infer_us)
 

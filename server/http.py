@@ -11,6 +11,7 @@ import math
 from collections.abc import Awaitable, Callable
 from functools import partial
 
+import msgspec
 from fastapi import FastAPI
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
@@ -69,12 +70,20 @@ class HttpDoor:
 
     async def bundle(self, request: Request) -> Response:
         """What is served, without a connection; needs the token as `Authorization: Bearer` where there is one."""
-        scheme, _, token = request.headers.get("authorization", "").partition(" ")
         try:
-            self._handlers.check_token(token if scheme.lower() == "bearer" else None)
+            self._check_bearer(request)
         except ProtocolError as error:
             return _refused(error, Format.JSON)
         return Response(self._summary, media_type=Format.JSON.value)
+
+    async def costs(self, request: Request) -> Response:
+        """What acquiring costs each connected engine, as declared and as measured; needs the token as `bundle` does."""
+        try:
+            self._check_bearer(request)
+            reports = await self._worker.run(self._handlers.costs)
+        except ProtocolError as error:
+            return _refused(error, Format.JSON)
+        return Response(msgspec.json.encode(reports), media_type=Format.JSON.value)
 
     async def healthz(self, request: Request) -> Response:
         """The process answers."""
@@ -85,6 +94,10 @@ class HttpDoor:
         if not self.ready:
             return _refused(NotReady("the server is draining", retry_after_s=1.0), Format.JSON)
         return Response(b'{"status":"ready"}', media_type=Format.JSON.value)
+
+    def _check_bearer(self, request: Request) -> None:
+        scheme, _, token = request.headers.get("authorization", "").partition(" ")
+        self._handlers.check_token(token if scheme.lower() == "bearer" else None)
 
     async def _body(self, request: Request, form: Format) -> bytes:
         limit = self._handlers.max_body_bytes[form]
@@ -109,7 +122,8 @@ def create_app(door: HttpDoor) -> FastAPI:
     app = FastAPI(title="Budgeted bot runtime", version=str(messages.PROTOCOL_VERSION), redoc_url=None)
     for path, (kind, _) in ROUTES.items():  # starlette's own routes: FastAPI's take a third longer a request
         app.router.routes.append(Route(path, _endpoint(door, kind), methods=["POST"]))
-    for path, probe in {"/v1/bundle": door.bundle, "/healthz": door.healthz, "/readyz": door.readyz}.items():
+    probes = {"/v1/bundle": door.bundle, "/v1/costs": door.costs, "/healthz": door.healthz, "/readyz": door.readyz}
+    for path, probe in probes.items():
         app.add_api_route(path, probe, methods=["GET"], response_class=Response)
     app.add_exception_handler(HTTPException, _http_refusal)
     app.add_exception_handler(Exception, _internal)

@@ -66,6 +66,7 @@ REQUESTS: dict[str, dict[str, Any]] = {
         "values": [[10.0, 1.0, 8.5], []],
         "failed": [[0, 0, 0, 0, 0, 0, 0, 0, 0, 1], [0, 1, 0, 0, 0, 0, 0, 0, 0, 0]],
     },
+    "submit_features_measured": {**_SUBMIT, "values": [[10.0, 1.0, 8.5, 9.5], [0.1]], "acquire_us": 40.5},
     "stop_bots": {"type": "stop_bots", "bots": _BOTS},
     "goodbye": {"type": "goodbye"},
 }
@@ -81,10 +82,11 @@ _WELCOME = {
     "max_bots": 256,
     "max_body_bytes": 65536,
     "target_cost_us": None,
+    "cost_quantile": 0.998,
 }
 REPLIES: dict[str, dict[str, Any]] = {
     "welcome": _WELCOME,
-    "welcome_no_context_target_cost": {**_WELCOME, "context_length": 1, "target_cost_us": 6.8},
+    "welcome_no_context_target_cost": {**_WELCOME, "context_length": 1, "target_cost_us": 6.8, "cost_quantile": None},
     "bots_started": {"type": "bots_started", "bots": _BOTS},
     "queries": {"type": "queries", "frame": 7, "queries": _QUERIES, "cost_us": [23.5, 17.5], "infer_us": 80.25},
     "actions": {
@@ -136,6 +138,8 @@ def _refused() -> dict[str, tuple[str, bytes]]:
         "infinite_reward": ("NON_FINITE", _pack({**query, "rewards": [0.0, float("inf")]})),
         "out_of_range": ("OUT_OF_RANGE", _pack({**query, "free": [[100.5, 0.0, 0.0], _FREE[1]]})),
         "value_out_of_range": ("OUT_OF_RANGE", _pack({**submit, "values": [[10.0, -1.0, 8.5, 9.5], [0.1]]})),
+        "nan_acquire_us": ("NON_FINITE", _pack({**submit, "acquire_us": float("nan")})),
+        "negative_acquire_us": ("OUT_OF_RANGE", _pack({**submit, "acquire_us": -1.0})),
     }
 
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bot_runtime.bundle import Bundle
+from bot_runtime.costs import Costs
 from bot_runtime.spending import Limits, Spending
 from protocol.features import CostModel
 
@@ -81,3 +82,12 @@ def test_shares_are_of_each_bots_own_full_cost(conditioned: Bundle) -> None:
 def test_the_smallest_costs_do_not_overflow(conditioned: Bundle) -> None:
     tiny = CostModel(0.0, (5e-324, 0.0, 0.0, 0.0, 0.0))
     assert spending(conditioned, tiny).terms(SLOTS, Limits.checked(N, [1e9] * N, None)).target_cost_N.tolist() == [1, 1]
+
+
+def test_measured_costs_replace_the_bots_own(conditioned: Bundle) -> None:
+    rows, measured = spending(conditioned), Costs(CostModel(1.0, (3.0,) * 5))
+    terms = rows.terms(SLOTS, Limits.checked(N, [8.0, 4.0], None), measured)
+    assert terms.costs_NM.tolist() == [[3.0] * 5] * N
+    assert terms.calls_N.tolist() == [1.0] * N
+    assert terms.target_cost_N.tolist() == [0.5, 0.25]  # of 16 µs in all
+    assert rows.terms(SLOTS, NOTHING).calls_N.tolist() == [16.0] * N

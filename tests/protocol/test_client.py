@@ -177,9 +177,10 @@ def test_codes_and_fields_of_a_newer_server() -> None:
     assert read_welcome(newer).features == TABLE
 
 
-def test_a_welcome_of_a_server_without_target_costs() -> None:
-    older = {name: value for name, value in VECTORS["welcome"].message.items() if name != "target_cost_us"}
-    assert read_welcome(older).target_cost_us is None
+@pytest.mark.parametrize("name", ["target_cost_us", "cost_quantile"])
+def test_a_welcome_of_a_server_that_is_older_than_a_field(name: str) -> None:
+    older = {field: value for field, value in VECTORS["welcome"].message.items() if field != name}
+    assert getattr(read_welcome(older), name) is None
 
 
 def test_an_array_bomb_takes_no_more_memory_than_its_bytes_could_fill() -> None:

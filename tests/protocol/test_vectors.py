@@ -134,7 +134,8 @@ def _submission(vector: Vector) -> dict[str, Any]:
     acquired = np.array(vector.message["acquired"], dtype=bool)
     costly = np.full((len(BOTS), TABLE.n_costly), 49.0, dtype=np.float32)
     costly[acquired[:, TABLE.owner]] = np.concatenate([np.array(row, np.float32) for row in vector.message["values"]])
-    return {"bots": BOTS, "frame": 7, "acquired": acquired, "costly": costly, "failed": vector.message.get("failed")}
+    optional = {name: vector.message.get(name) for name in ("failed", "acquire_us")}
+    return {"bots": BOTS, "frame": 7, "acquired": acquired, "costly": costly, **optional}
 
 
 def test_the_client_writes_requests_byte_for_byte() -> None:
@@ -144,10 +145,11 @@ def test_the_client_writes_requests_byte_for_byte() -> None:
     client.start(2, seeds=[1, 2**63 - 1], target_returns=[100, 50.5], budgets_us=[20, 0], target_costs_us=[4.5, 0])
     client.act(**_submission(VECTORS["submit_features"]))
     client.act(**_submission(VECTORS["submit_features_failed"]))
+    client.act(**_submission(VECTORS["submit_features_measured"]))
     client.stop(BOTS)
     client.close()
     names = ["hello", "hello_cost_model_token", "start_bots", "start_bots_all"]
-    names += ["submit_features", "submit_features_failed", "stop_bots", "goodbye"]
+    names += ["submit_features", "submit_features_failed", "submit_features_measured", "stop_bots", "goodbye"]
     assert recorder.sent == [VECTORS[name].body for name in names]
 
 
