@@ -23,12 +23,13 @@ def bundle_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_no_violations_in_ten_thousand_frames(bundle_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(Budget(frames=10_001, bundle=bundle_path, json=True)) == 0
+    assert main(Budget(frames=10_001, bundle=bundle_path, ray_frames=0, repeats=2, json=True)) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 1
     result = json.loads(lines[0])
     assert result["violations"] == 0
     assert result["frames"] == 10_001
+    assert result["measured_over_pct"] is None
     assert set(result["by_source"]) == SOURCES
     for tally in result["by_source"].values():
         assert tally["frames"] >= 2000
@@ -38,16 +39,16 @@ def test_no_violations_in_ten_thousand_frames(bundle_path: Path, capsys: pytest.
 
 
 def test_the_table_names_every_source(bundle_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(Budget(frames=50, bundle=bundle_path)) == 0
+    assert main(Budget(frames=50, bundle=bundle_path, ray_frames=5, calibration=5, ray_bots=2, repeats=2)) == 0
     printed = capsys.readouterr().out
-    assert all(source in printed for source in SOURCES)
+    assert all(words in printed for words in [*SOURCES, "500 bots x 64 rays", "by the cpu clock", "charged µs"])
 
 
 def test_overspending_is_found(
     bundle_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(budget, "allocate", lambda probs_NM, sampled_NM, **rest: sampled_NM)
-    assert main(Budget(frames=1000, bundle=bundle_path, json=True)) == 1
+    assert main(Budget(frames=1000, bundle=bundle_path, ray_frames=0, repeats=2, json=True)) == 1
     result = json.loads(capsys.readouterr().out)
     assert all(tally["violations"] > 0 for tally in result["by_source"].values())
 
@@ -57,7 +58,7 @@ def test_an_allocation_without_a_margin_is_found(
 ) -> None:
     """Sums that are right as floats and wrong as numbers: only the adversarial source meets them."""
     monkeypatch.setattr("bot_runtime.budget._MARGIN_PER_TERM", 0.0)
-    assert main(Budget(frames=10_000, bundle=bundle_path, json=True)) == 1
+    assert main(Budget(frames=10_000, bundle=bundle_path, ray_frames=0, repeats=2, json=True)) == 1
     assert json.loads(capsys.readouterr().out)["by_source"]["adversarial"]["violations"] > 0
 
 
