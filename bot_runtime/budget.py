@@ -55,12 +55,12 @@ def allocate(
     asked_NM &= is_cost
     asked_NM &= is_call[:, None]
     costs_NM = np.broadcast_to(_cleaned(costs_us, is_cost), sampled_NM.shape)
-    wishes = Wishes(asked_NM, _cleaned(probs_NM, is_prob), costs_NM, _cleaned(calls_N, is_call))
+    wishes = Wishes(asked_NM, _cleaned(probs_NM, is_prob), costs_NM, _cleaned(calls_N, is_call)).only(asked_NM)
     with np.errstate(all="ignore"):  # hostile numbers overflow; infinities compare as they should
         query_NM = fit_rows(wishes, _limits(budgets_N, n_queries + 1))
         if frame_budget_us is not None:
             limit = _limits(np.array([frame_budget_us], dtype=np.float64), n_bots * (n_queries + 1))
-            query_NM = fit_frame(wishes._replace(asked_NI=query_NM), float(limit[0]))
+            query_NM = fit_frame(wishes if query_NM is asked_NM else wishes.only(query_NM), float(limit[0]))
     return query_NM
 
 

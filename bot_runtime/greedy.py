@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bot_runtime.wishes import Ranked, Wishes, density, falling
+from bot_runtime.wishes import Wishes, density, falling
 
 __all__ = ["MAX_PASSES", "fit_frame", "fit_rows"]
 
@@ -34,7 +34,7 @@ __all__ = ["MAX_PASSES", "fit_frame", "fit_rows"]
 # different ones may end early, which only leaves budget unspent.
 MAX_PASSES = 64
 _BLOCK = 512
-_LARGEST = np.finfo(np.float64).max
+_ROUNDING = 1e-9
 
 _Bools = NDArray[np.bool_]
 _Floats = NDArray[np.float64]
@@ -46,7 +46,7 @@ def fit_rows(wishes: Wishes, limits_N: _Floats) -> _Bools:
     asked_NI = wishes.asked_NI
     if np.isposinf(limits_N).all():
         return asked_NI
-    tight = np.flatnonzero(~(wishes.totals_N() <= limits_N) & asked_NI.any(axis=1))
+    tight = np.flatnonzero(~(wishes.us_N(asked_NI) <= limits_N) & asked_NI.any(axis=1))
     if tight.size == 0:
         return asked_NI
     rows, limits_R = wishes.rows(tight), limits_N[tight]
@@ -57,21 +57,17 @@ def fit_rows(wishes: Wishes, limits_N: _Floats) -> _Bools:
 
 def fit_frame(wishes: Wishes, limit: float) -> _Bools:
     """What all bots together may ask for within one limit: all, where that fits."""
-    asked_NI, totals_N = wishes.asked_NI, wishes.totals_N()
+    asked_NI, totals_N = wishes.asked_NI, wishes.us_N(wishes.asked_NI)
     if totals_N.sum() <= limit or not asked_NI.any():
         return asked_NI
     if limit < 0.0:
         return np.zeros_like(asked_NI)
+    frame = _Frame(wishes, limit)
     if wishes.calls_N.any():
-        chosen_NI = _greedy_with_calls(wishes, limit)
+        frame.greedy_with_calls(totals_N)
     else:
-        frame = _Frame(asked_NI, wishes.costs_NI, wishes.calls_N, limit)
-        places_K = np.flatnonzero(asked_NI)
-        frame.run(places_K[falling(density(wishes.value_NI.take(places_K), wishes.costs_NI.take(places_K)))])
-        places_K = frame.fitting()
-        frame.fill(places_K[falling(density(wishes.value_NI.take(places_K), wishes.costs_NI.take(places_K)))])
-        chosen_NI = frame.taken_NW
-    return _alone_if_better(chosen_NI, wishes, totals_N, limit)
+        frame.greedy()
+    return _alone_if_better(frame.taken_NI, wishes, totals_N, limit)
 
 
 def _greedy_rows(wishes: Wishes, limits_R: _Floats) -> _Bools:
@@ -130,89 +126,96 @@ def _alone_if_better(chosen_NI: _Bools, wishes: Wishes, totals_N: _Floats, limit
     return chosen_NI
 
 
-def _greedy_with_calls(wishes: Wishes, limit: float) -> _Bools:
-    """Greedy with skips over all bots at once: the longest run of whole openings and later features, then the rest."""
-    ranked = wishes.ranked()
-    openings = _openings(ranked, wishes.calls_N)
-    frame = _Frame(ranked.asked_NW, ranked.costs_NW, wishes.calls_N, limit)
-    later_K = np.flatnonzero(ranked.asked_NW ^ openings.opening_NW)
-    slopes = np.concatenate([openings.slopes_NW[:, 0], openings.slopes_NW.take(later_K)])
-    costs = np.concatenate([openings.costs_N, ranked.costs_NW.take(later_K)])
-    frame.run_openings(falling(slopes), costs, later_K, openings.opening_NW)
-    places_K = frame.fitting()
-    frame.fill(places_K[falling(openings.slopes_NW.take(places_K))])
-    return ranked.unranked(frame.taken_NW, wishes.asked_NI)
-
-
 class _Openings(NamedTuple):
-    """By bot: which of its features open, and what they cost, the call included. The slopes of all its features."""
+    """By bot: which of its features open, what they cost with the call, what they are worth per µs. Cost 0 if none."""
 
-    opening_NW: _Bools
+    opening_NI: _Bools
     costs_N: _Floats
-    slopes_NW: _Floats
+    slopes_N: _Floats
 
 
-def _openings(ranked: Ranked, calls_N: _Floats) -> _Openings:
-    """Of features in the order of density, those up to the most that they are worth per µs with the call."""
-    costs_NW = np.cumsum(ranked.costs_NW, axis=1)
-    costs_NW += calls_N[:, None]
-    slopes_NW = np.cumsum(ranked.value_NW, axis=1)
-    slopes_NW /= costs_NW
-    np.fmin(slopes_NW, _LARGEST, out=slopes_NW)  # of hostile numbers infinity by infinity
-    last_N1 = slopes_NW.argmax(axis=1)[:, None]
-    best_N1 = np.take_along_axis(slopes_NW, last_N1, axis=1)
-    opening_NW = np.arange(costs_NW.shape[1]) <= last_N1
-    opening_NW &= ranked.asked_NW
-    costs_N = np.take_along_axis(costs_NW, last_N1, axis=1)[:, 0] * opening_NW[:, 0]
-    # No later feature before its opening: as real numbers none would be, but these are rounded.
-    np.minimum(ranked.density_NW, np.maximum(best_N1, 0.0), out=slopes_NW)
-    return _Openings(opening_NW, costs_N, slopes_NW)
+def _openings(wishes: Wishes, density_NI: _Floats, totals_N: _Floats) -> _Openings:
+    """The features that together are worth the most per µs, call included: Dinkelbach's iteration for the ratio.
+
+    From the ratio of all that is asked for: those that are denser have a better one, until nothing changes.
+    """
+    asked_NI = wishes.asked_NI
+    densest_N = (density_NI * asked_NI).max(axis=1)
+    slopes_N = wishes.worth_N(asked_NI) / totals_N
+    for _ in range(MAX_PASSES):
+        slopes_N = np.fmin(slopes_N, densest_N)  # at least one feature, whatever rounding or hostile numbers do
+        opening_NI = density_NI >= slopes_N[:, None]
+        opening_NI &= asked_NI
+        costs_N = wishes.us_N(opening_NI)
+        better_N = wishes.worth_N(opening_NI) / costs_N
+        if not (better_N > slopes_N * (1.0 + _ROUNDING)).any():
+            break
+        slopes_N = better_N
+    return _Openings(opening_NI, costs_N, slopes_N)
 
 
 class _Frame:
-    """What has been taken of what N bots ask for in W columns, and what that has cost. Places are flat."""
+    """What has been taken of what N bots ask for, and what that has cost. Places are flat."""
 
-    def __init__(self, asked_NW: _Bools, costs_NW: _Floats, calls_N: _Floats, limit: float) -> None:
-        self.taken_NW = np.zeros_like(asked_NW)
-        self._asked_NW, self._costs_NW, self._limit = asked_NW, costs_NW, limit
-        self._unpaid_N = calls_N.copy()
+    def __init__(self, wishes: Wishes, limit: float) -> None:
+        self.taken_NI = np.zeros_like(wishes.asked_NI)
+        self._wishes, self._limit = wishes, limit
+        self._unpaid_N = wishes.calls_N.copy()
         self._spent = 0.0
 
-    def run(self, places_K: _Ints) -> None:
-        """Take the longest run that fits, where no call is to be paid."""
-        n, self._spent = _longest_run(self._costs_NW.take(places_K), self._spent, self._limit)
-        self.taken_NW.reshape(-1)[places_K[:n]] = True
+    def greedy(self) -> None:
+        """Where no call costs anything: the longest run in the order of density, then what still fits."""
+        places_K = self._by_density(np.flatnonzero(self._wishes.asked_NI))
+        n, self._spent = _longest_run(self._wishes.costs_NI.take(places_K), self._spent, self._limit)
+        self.taken_NI.reshape(-1)[places_K[:n]] = True
+        self._fill(self._by_density(self._fitting()))
 
-    def run_openings(self, order: _Ints, costs: _Floats, later_K: _Ints, opening_NW: _Bools) -> None:
-        """Take the longest run that fits, of N openings and then K features in this order; part of the next opening.
-
-        Each opening comes before its bot's later features.
-        """
-        n_bots = self._unpaid_N.size
+    def greedy_with_calls(self, totals_N: _Floats) -> None:
+        """The longest run of whole openings and later features in the order of slopes, then what still fits."""
+        wishes, n_bots = self._wishes, self._unpaid_N.size
+        density_NI = density(wishes.value_NI, wishes.costs_NI)
+        openings = _openings(wishes, density_NI, totals_N)
+        later_K = np.flatnonzero(wishes.asked_NI ^ openings.opening_NI)
+        # Openings come first, also among equals: no later feature is taken before its bot's call is paid.
+        order = falling(np.concatenate([openings.slopes_N, density_NI.take(later_K)]))
+        costs = np.concatenate([openings.costs_N, wishes.costs_NI.take(later_K)])
         n, self._spent = _longest_run(costs.take(order), self._spent, self._limit)
         is_opening = order[:n] < n_bots
         opened = order[np.flatnonzero(is_opening)]
         self._unpaid_N[opened] = 0.0
-        self.taken_NW[opened] = opening_NW[opened]
-        self.taken_NW.reshape(-1)[later_K.take(order[np.flatnonzero(~is_opening)] - n_bots)] = True
+        self.taken_NI[opened] = openings.opening_NI[opened]
+        self.taken_NI.reshape(-1)[later_K.take(order[np.flatnonzero(~is_opening)] - n_bots)] = True
         if n < order.size and order[n] < n_bots:
-            bot = int(order[n])
-            costs = self._costs_NW[bot, : np.count_nonzero(opening_NW[bot])].copy()
-            costs[0] += self._unpaid_N[bot]
-            n, self._spent = _longest_run(costs, self._spent, self._limit)
-            self.taken_NW[bot, :n] = True
-            self._unpaid_N[bot] *= n == 0
+            self._open_partly(int(order[n]), openings)
+        places_K = self._by_density(self._fitting())
+        bots_K = places_K // wishes.asked_NI.shape[1]
+        slopes_K = np.minimum(openings.slopes_N.take(bots_K), density_NI.take(places_K))
+        self._fill(places_K[falling(slopes_K)])
 
-    def fitting(self) -> _Ints:
+    def _open_partly(self, bot: int, openings: _Openings) -> None:
+        """Take the longest run of an opening that does not fit as a whole."""
+        features = self._by_density(np.flatnonzero(openings.opening_NI[bot]) + bot * self.taken_NI.shape[1])
+        costs = self._wishes.costs_NI.take(features)
+        costs[0] += self._unpaid_N[bot]
+        n, self._spent = _longest_run(costs, self._spent, self._limit)
+        self.taken_NI.reshape(-1)[features[:n]] = True
+        if n:
+            self._unpaid_N[bot] = 0.0
+
+    def _by_density(self, places_K: _Ints) -> _Ints:
+        value_K, costs_K = self._wishes.value_NI.take(places_K), self._wishes.costs_NI.take(places_K)
+        return places_K[falling(density(value_K, costs_K))]
+
+    def _fitting(self) -> _Ints:
         """Places of all that has not been taken and might still fit."""
-        left_NW = self._costs_NW <= (self._limit - self._spent - self._unpaid_N)[:, None]
-        left_NW &= self._asked_NW
-        left_NW &= ~self.taken_NW
-        return np.flatnonzero(left_NW)
+        left_NI = self._wishes.costs_NI <= (self._limit - self._spent - self._unpaid_N)[:, None]
+        left_NI &= self._wishes.asked_NI
+        left_NI &= ~self.taken_NI
+        return np.flatnonzero(left_NI)
 
-    def fill(self, places_K: _Ints) -> None:
+    def _fill(self, places_K: _Ints) -> None:
         """Greedy with skips in this order, a run at a time, each bot's unpaid call on top of its first feature."""
-        bots_K, costs_K = places_K // self.taken_NW.shape[1], self._costs_NW.take(places_K)
+        bots_K, costs_K = places_K // self.taken_NI.shape[1], self._wishes.costs_NI.take(places_K)
         for _ in range(MAX_PASSES):
             alone_K = costs_K + self._unpaid_N.take(bots_K)
             fits = np.flatnonzero(self._spent + alone_K <= self._limit)
@@ -226,7 +229,7 @@ class _Frame:
             prices_K = costs_K.copy()
             prices_K[first] = alone_K[first]
             n, self._spent = _longest_run(prices_K, self._spent, self._limit)
-            self.taken_NW.reshape(-1)[places_K[:n]] = True
+            self.taken_NI.reshape(-1)[places_K[:n]] = True
             self._unpaid_N[bots_K[:n]] = 0.0
             places_K, bots_K, costs_K = places_K[n:], bots_K[n:], costs_K[n:]
 

@@ -20,7 +20,7 @@ _Ints = NDArray[np.int64]
 class Wishes(NamedTuple):
     """What N bots would ask for of I features each. All numbers are finite, costs are at least 0.
 
-    A bot's call is paid once if it asks for anything.
+    A bot's call is paid once; it is 0 where a bot asks for nothing.
     """
 
     asked_NI: _Bools
@@ -32,9 +32,13 @@ class Wishes(NamedTuple):
         """The values of a query, summed by bot."""
         return _row_sums(self.value_NI, query_NI)
 
-    def totals_N(self) -> _Floats:
-        """What all that each bot asks for costs it."""
-        return _row_sums(self.costs_NI, self.asked_NI) + self.calls_N * self.asked_NI.any(axis=1)
+    def us_N(self, query_NI: _Bools) -> _Floats:
+        """What a query costs by bot, given that each bot with wishes asks for something in it."""
+        return _row_sums(self.costs_NI, query_NI) + self.calls_N
+
+    def only(self, query_NI: _Bools) -> Wishes:
+        """The same bots asking for no more than this."""
+        return self._replace(asked_NI=query_NI, calls_N=self.calls_N * query_NI.any(axis=1))
 
     def rows(self, bots: _Ints) -> Wishes:
         """The same for some of the bots."""
