@@ -137,8 +137,10 @@ class Costs:
         margin = math.exp(self._log_margin)
         bounds = zip(self._shape, self._least, self._most, strict=True)
         self._charged = [min(max(number * margin, least), most) for number, least, most in bounds]
-        self.call_us = self._charged[0] * self._unit_us
-        self.costs_M = np.array(self._charged[1:])[self._group_M] * self.declared.costs_us
+        # A factor within its bounds may round past the largest cost there is.
+        self.call_us = min(self._charged[0] * self._unit_us, _LARGEST_US)
+        charged_M = np.array(self._charged[1:])[self._group_M] * self.declared.costs_us
+        self.costs_M = np.minimum(charged_M, _LARGEST_US)
 
     @property
     def full_us(self) -> float:

@@ -245,3 +245,9 @@ def test_a_turn_is_measured_once_and_a_retry_repeats_its_measurement(bots: Bots)
         with pytest.raises(FrameReused):
             submit(other)
     assert (costs.n_frames, costs.model) == (1, model)
+
+
+def test_a_cost_at_the_largest_there_is_does_not_round_past_it() -> None:
+    costs = Costs(CostModel(0.0, (660263.0,)))
+    costs.observe(np.ones((2, 1), dtype=bool), 1e9)
+    assert costs.model.feature_us == (1e6,)
