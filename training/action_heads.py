@@ -7,6 +7,8 @@ queries, memory or files. Shape letters: W width of the state, A action componen
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -16,7 +18,7 @@ __all__ = ["ActionHead", "BinsHead", "GaussianHead", "nearest_bins"]
 _LEAST_DEVIATION, _MOST_DEVIATION = -4.0, 1.0  # log of it, in half ranges of the action
 
 
-class ActionHead(nn.Linear):
+class ActionHead(nn.Linear, ABC):
     """A linear layer on the state, and what it means."""
 
     low: Tensor
@@ -27,13 +29,13 @@ class ActionHead(nn.Linear):
         self.register_buffer("low", torch.tensor(low), persistent=False)
         self.register_buffer("high", torch.tensor(high), persistent=False)
 
+    @abstractmethod
     def losses(self, hidden: Tensor, actions: Tensor) -> Tensor:
         """-log π̃(a | ...) of the recorded actions [..., A], summed over their components, up to a constant: [...]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def actions(self, hidden: Tensor, noise: Tensor) -> Tensor:
         """Raw action numbers [..., A]; `noise` [..., A] uniform in [0, 1) drives the components that are sampled."""
-        raise NotImplementedError
 
 
 class BinsHead(ActionHead):
