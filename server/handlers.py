@@ -140,7 +140,8 @@ class Handlers:
             request.frame_budget_us,
             request.budgets_us,
             request.target_costs_us,
-            connection.costs,
+            # Nothing measured yet: the costs are those of the bots' start, which the runtime has at hand.
+            connection.costs if connection.costs.n_frames else None,
         )
         queries = arrays.pack_bits(turn.query_NM, form)
         return Queries(frame=turn.frame, queries=queries, cost_us=turn.cost_us_N.tolist(), infer_us=turn.infer_us)

@@ -10,10 +10,10 @@ from typing import Literal
 
 import msgspec
 
-__all__ = ["TrainConfig"]
+__all__ = ["DATASET_NAME", "TrainConfig"]
 
 
-_DATASET = re.compile(r"(?P<map>[a-z0-9]+)-(?P<quality>[a-z0-9-]+)-v\d+")
+DATASET_NAME = re.compile(r"(?P<map>[a-z0-9]+)-(?P<quality>[a-z0-9-]+)-v\d+")  # such as hard-expert-v0
 _COUNTS = ("window", "width", "n_layers", "n_heads", "encoder_width", "batch", "updates", "warmup", "sweeps")
 _COUNTS += ("frame_bots", "log_every", "checkpoint_every")
 
@@ -111,7 +111,7 @@ class TrainConfig:
     def dataset_name(self) -> str:
         """`hopper-expert-v0`; with `hopper-medium-v0` it is `hopper-medium-expert-v0`, as D4RL calls them."""
         names = [path.name for path in (self.dataset, *self.more_datasets)]
-        matches = [_DATASET.fullmatch(name) for name in names]
+        matches = [DATASET_NAME.fullmatch(name) for name in names]
         if len(names) == 1 or not all(matches) or len({match["map"] for match in matches if match}) > 1:
             return "+".join(names)
         qualities = sorted((match["quality"] for match in matches if match), reverse=True)

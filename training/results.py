@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from training.config import TrainConfig
+from training.config import DATASET_NAME, TrainConfig
 
 __all__ = ["BASE", "NO_RAYS", "Constraint", "Kind", "Measurement", "Results", "Run", "Series", "Setting"]
 
@@ -23,7 +23,6 @@ BASE = "base"  # every feature, always
 NO_RAYS = "none"  # no costly feature, ever
 
 _LABEL = re.compile(r"(soft|hard)-([0-9.e+-]+)\.json")
-_DATASET = re.compile(r"(?P<map>[a-z0-9]+)-(?P<quality>[a-z0-9-]+)-v\d+")
 
 
 class Setting(NamedTuple):
@@ -40,7 +39,7 @@ class Setting(NamedTuple):
     def of(cls, config: TrainConfig) -> Setting:
         """`hard-expert-v0` is the map hard and the dataset expert; another name is a dataset without a map.
         `hard-noisy.json` are the features noisy of the map hard."""
-        match = _DATASET.fullmatch(config.dataset_name)
+        match = DATASET_NAME.fullmatch(config.dataset_name)
         if match is None:
             return cls("", config.dataset_name)
         return cls(match["map"], match["quality"], config.feature_set)
