@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 ARGS ?=
+# What `make test` installs: every extra but `peers`, which only benchmarks.peers needs.
+EXTRAS := server game training sweep locomotion telemetry fuzz dev
 
 .PHONY: demo test lint bench lock clean
 .DELETE_ON_ERROR:
@@ -45,7 +47,7 @@ lock: $(VENV)/all
 	$(BIN)/pip-compile -q --upgrade --strip-extras --no-annotate --no-header --no-emit-index-url --no-emit-find-links \
 		pyproject.toml --extra server --extra game -o requirements/runtime.lock
 	$(BIN)/pip-compile -q --upgrade --strip-extras --no-annotate --no-header --no-emit-index-url --no-emit-find-links \
-		pyproject.toml --all-extras -c requirements/runtime.lock -o requirements/all.lock
+		pyproject.toml $(foreach extra,$(EXTRAS),--extra $(extra)) -c requirements/runtime.lock -o requirements/all.lock
 	sed -i 's/^\(torch==[0-9.]*\)+.*/\1/' requirements/all.lock
 
 clean:
