@@ -11,7 +11,6 @@ process; with two cores or more it has one to itself.
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.cores import set_apart
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
 from bot_runtime.golden import Golden, read_golden
@@ -113,7 +113,7 @@ def measure(config: Latency, console: Console) -> dict[str, dict[int, NDArray[np
         server = stack.enter_context(ServerProcess(config.bundle, "--tcp-port", "0", "--max-bots", most))
         addresses = server.addresses()
         if config.pin:
-            stack.callback(_pin(server.pid))
+            stack.callback(set_apart([server.pid]))
         progress = stack.enter_context(Progress(console=console))
         task = progress.add_task("turns", total=len(config.bots) * config.turns * len(times))
         for n_bots in config.bots:
@@ -137,16 +137,6 @@ def _rounds(play: dict[str, Callable[[], Timed]], turns: int, advance: Callable[
                 rows[name].append(turn())
                 advance(1)
     return rows
-
-
-def _pin(server_pid: int) -> Callable[[], None]:
-    """The server on one core, this process on another; returns what undoes the latter."""
-    cores = sorted(os.sched_getaffinity(0))
-    if len(cores) < 2:
-        return lambda: None
-    os.sched_setaffinity(server_pid, {cores[1]})
-    os.sched_setaffinity(0, {cores[0]})
-    return lambda: os.sched_setaffinity(0, cores)
 
 
 def _table(times: dict[str, dict[int, NDArray[np.float64]]]) -> Table:
