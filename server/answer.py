@@ -1,12 +1,13 @@
 """One request's bytes in, one reply's bytes out, whatever happens in between.
 
-This module knows nothing about which transport the bytes came by. No exception leaves it and no traceback is ever sent.
+Every answered request passes here, with how and when it arrived. No exception leaves it and no traceback is ever sent.
 """
 
 from __future__ import annotations
 
 import logging
-from typing import NamedTuple
+import time
+from typing import NamedTuple, Self
 
 from protocol import codec
 from protocol.codec import Format
@@ -14,9 +15,21 @@ from protocol.errors import InternalError, ProtocolError
 from protocol.messages import Error, Reply, Request
 from server.handlers import Handlers
 
-__all__ = ["Answer", "answer", "refusal"]
+__all__ = ["Answer", "Arrival", "answer", "refusal"]
 
 _log = logging.getLogger(__name__)
+
+
+class Arrival(NamedTuple):
+    """By which transport a request came (`http`, `tcp`, `unix`) and when it was whole: ns of the monotonic clock."""
+
+    transport: str
+    received_ns: int
+
+    @classmethod
+    def now(cls, transport: str) -> Self:
+        """A request that has just been read to its end."""
+        return cls(transport, time.monotonic_ns())
 
 
 class Answer(NamedTuple):
@@ -32,11 +45,15 @@ def answer(
     body: bytes,
     form: Format,
     connection_id: str | None,
+    arrival: Arrival,
     *,
     kind: type[Request] | None = None,
     reply_form: Format | None = None,
 ) -> Answer:
-    """Decode, handle, encode. `kind` is the message type where the door fixes it; `reply_form` is else `form`."""
+    """Decode, handle, encode. `arrival` is how and when the request came.
+
+    `kind` is the message type where the door fixes it; `reply_form` is else `form`.
+    """
     reply_form = reply_form or form
     try:
         request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)

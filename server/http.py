@@ -32,7 +32,7 @@ from protocol.errors import (
     TooLarge,
     UnsupportedMediaType,
 )
-from server.answer import Answer, answer, refusal
+from server.answer import Answer, Arrival, answer, refusal
 from server.handlers import Handlers
 from server.openapi import CONNECTION_HEADER, ROUTES, document, summary
 from server.worker import Worker
@@ -61,7 +61,8 @@ class HttpDoor:
             reply_form = reply_form or form
             body = await self._body(request, form)
             connection = None if kind is messages.Hello else request.headers.get(CONNECTION_HEADER)
-            job = partial(answer, self._handlers, body, form, connection, kind=kind, reply_form=reply_form)
+            arrival = Arrival.now("http")
+            job = partial(answer, self._handlers, body, form, connection, arrival, kind=kind, reply_form=reply_form)
             return _response(await self._worker.run(job), reply_form)
         except ProtocolError as error:
             return _refused(error, reply_form or Format.JSON)

@@ -11,11 +11,12 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from socket import AF_UNIX
 
 from protocol.codec import Format
 from protocol.errors import NotReady, TooLarge, TooManyConnections
 from protocol.messages import Farewell, Welcome
-from server.answer import Answer, answer, refusal
+from server.answer import Answer, Arrival, answer, refusal
 from server.handlers import Handlers
 from server.worker import Worker
 
@@ -86,7 +87,10 @@ class StreamDoor:
                 await socket.send(refusal(error, Format.MSGPACK).body)
                 await socket.discard()
                 return
-            reply = await self._answer(partial(answer, self._handlers, body, Format.MSGPACK, socket.connection))
+            arrival = Arrival.now(socket.transport)
+            reply = await self._answer(
+                partial(answer, self._handlers, body, Format.MSGPACK, socket.connection, arrival)
+            )
             if isinstance(reply.reply, Welcome):
                 socket.connection = reply.reply.connection
             await socket.send(reply.body)
@@ -107,6 +111,7 @@ class _Socket:
         self._reader = reader
         self._writer = writer
         self._deadline_s = deadline_s
+        self.transport = "unix" if writer.get_extra_info("socket").family is AF_UNIX else "tcp"
         self.connection: str | None = None
         self.receiving = False
 
