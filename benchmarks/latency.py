@@ -1,8 +1,8 @@
 """How long does a turn take? In process, over a Unix socket, TCP and HTTP, for 1 to 256 bots.
 
-A turn is one RequestQueries and one SubmitFeatures for all N bots: two round trips where there is a wire. *Model* is
-the time in the two ONNX graphs (the replies' `infer_us`); what is left is allocation, bookkeeping, codec and transport.
-Rounds visit every transport in turn, so that the ratios hold when the machine's speed drifts. The server is its own
+A turn is one RequestQueries and one SubmitFeatures for all N bots: two round trips where there is a wire, without what
+the engine does between them. *Model* is the time in the two ONNX graphs (the replies' `infer_us`); what is left
+is allocation, bookkeeping, codec and transport. Rounds visit every transport in turn, so that the ratios hold when the machine's speed drifts. The server is its own
 process; with two cores or more it has one to itself.
 
     python -m benchmarks.latency --json
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -26,9 +25,9 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.cores import set_apart
-from bot_runtime.bots import Bots
+from benchmarks.recorded import Timed, in_process, over
 from bot_runtime.bundle import Bundle
-from bot_runtime.golden import Golden, read_golden
+from bot_runtime.golden import read_golden
 from game.launcher import ServerProcess
 from protocol.client import BotClient
 
@@ -51,58 +50,6 @@ class Latency:
     json: bool = False  # print one JSON line instead of a table
 
 
-Timed = tuple[float, float]  # µs of a whole turn, and of the model in it
-
-
-class _Player:
-    """Plays recorded frames, the same ones over every transport."""
-
-    def __init__(self, bundle: Bundle, golden: Golden, n_bots: int) -> None:
-        self._table = bundle.manifest.features
-        self._free_TF, self._costly_TD = golden["free"], golden["costly"]
-        self._n_bots, self._frame = n_bots, 0
-
-    def turn(self, ask: Callable[..., tuple[NDArray[np.bool_], float]], act: Callable[..., float]) -> Timed:
-        """One turn of all bots; bot n is n frames ahead in the recording, so that a batch is not N equal rows."""
-        rows = (self._frame + np.arange(self._n_bots)) % len(self._free_TF)
-        free_NF, costly_ND = self._free_TF[rows], self._costly_TD[rows]
-        begun = time.perf_counter_ns()
-        query_NM, asked_us = ask(self._frame, free_NF)
-        known_ND = np.where(query_NM[:, self._table.owner], costly_ND, np.float32(0.0))
-        acted_us = act(self._frame, query_NM, known_ND)
-        whole_us = (time.perf_counter_ns() - begun) / 1e3
-        self._frame += 1
-        return whole_us, asked_us + acted_us
-
-
-def _in_process(bundle: Bundle, golden: Golden, n_bots: int) -> Callable[[], Timed]:
-    bots, player = Bots(bundle, max_bots=n_bots), _Player(bundle, golden, n_bots)
-    handles = bots.start(n_bots)
-
-    def ask(frame: int, free_NF: NDArray[np.float32]) -> tuple[NDArray[np.bool_], float]:
-        queries = bots.request_queries(handles, frame, free_NF)
-        return queries.query_NM, queries.infer_us
-
-    def act(frame: int, query_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]) -> float:
-        return bots.submit_features(handles, frame, query_NM, costly_ND).infer_us
-
-    return lambda: player.turn(ask, act)
-
-
-def _over(client: BotClient, bundle: Bundle, golden: Golden, n_bots: int) -> Callable[[], Timed]:
-    client.hello()
-    handles, player = client.start(n_bots), _Player(bundle, golden, n_bots)
-
-    def ask(frame: int, free_NF: NDArray[np.float32]) -> tuple[NDArray[np.bool_], float]:
-        queries = client.query(handles, frame, free_NF)
-        return queries.queries, queries.infer_us
-
-    def act(frame: int, query_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]) -> float:
-        return client.act(handles, frame, query_NM, costly_ND).infer_us
-
-    return lambda: player.turn(ask, act)
-
-
 def measure(config: Latency, console: Console) -> dict[str, dict[int, NDArray[np.float64]]]:
     """Whole turn and model time in µs, [turns, 2], by transport and number of bots."""
     bundle = Bundle.load(config.bundle)
@@ -118,9 +65,9 @@ def measure(config: Latency, console: Console) -> dict[str, dict[int, NDArray[np
         task = progress.add_task("turns", total=len(config.bots) * config.turns * len(times))
         for n_bots in config.bots:
             with ExitStack() as clients:
-                play = {"inproc": _in_process(bundle, golden, n_bots)}
+                play = {"inproc": in_process(bundle, golden, n_bots)}
                 for name, door in _DOORS.items():
-                    play[name] = _over(clients.enter_context(BotClient(addresses[door])), bundle, golden, n_bots)
+                    play[name] = over(clients.enter_context(BotClient(addresses[door])), bundle, golden, n_bots)
                 for name, rows in _rounds(play, config.turns, lambda done: progress.advance(task, done)).items():
                     times[name][n_bots] = np.array(rows)
     return times
