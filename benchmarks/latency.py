@@ -1,9 +1,9 @@
 """How long does a turn take? In process, over a Unix socket, TCP and HTTP, for 1 to 256 bots.
 
 A turn is one RequestQueries and one SubmitFeatures for all N bots: two round trips where there is a wire, without what
-the engine does between them. *Model* is the time in the two ONNX graphs (the replies' `infer_us`); what is left
-is allocation, bookkeeping, codec and transport. Rounds visit every transport in turn, so that the ratios hold when the machine's speed drifts. The server is its own
-process; with two cores or more it has one to itself.
+the engine does between them. *Model* is the time in the two ONNX graphs (the replies' `infer_us`); what is left is
+allocation, bookkeeping, codec and transport. Rounds visit every transport in turn, so that the ratios hold when the
+machine's speed drifts. The server is its own process; with two cores or more it has one to itself.
 
     python -m benchmarks.latency --json
 """
