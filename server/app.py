@@ -13,11 +13,12 @@ from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, supp
 
 import uvicorn
 
-from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
 from server.connections import Connections
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
+from server.serving import Serving
+from server.servings import Servings
 from server.settings import Settings
 from server.stream import StreamDoor
 from server.worker import Worker
@@ -34,12 +35,13 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
     On leaving it is not ready at once, closes idle sockets, answers what is in progress for at most `drain_s`, and
     leaves no thread, socket or file behind. `clock` is what connections age by. Raises BadBundle, OSError.
     """
-    bots = Bots(Bundle.load(settings.bundle), max_bots=settings.max_bots)
-    handlers = Handlers(bots, Connections(settings.max_connections, settings.idle_ttl_s, clock), settings.token)
+    servings = Servings(settings.max_bots)
+    servings.activate(Serving(Bundle.load(settings.bundle), max_bots=settings.max_bots))
+    handlers = Handlers(servings, Connections(settings.max_connections, settings.idle_ttl_s, clock), settings.token)
     async with AsyncExitStack() as stack:
         worker = Worker(settings.max_queue)
         stack.callback(worker.close)
-        http = HttpDoor(handlers, worker, bots.bundle.manifest, body_deadline_s=settings.frame_deadline_s)
+        http = HttpDoor(handlers, worker, body_deadline_s=settings.frame_deadline_s)
         uvicorn_server, http_address = await stack.enter_async_context(_http(settings, http))
         stream = StreamDoor(
             handlers,

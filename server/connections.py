@@ -13,15 +13,20 @@ from dataclasses import dataclass, field
 from bot_runtime.costs import Costs
 from protocol.errors import NoBot, NoConnection, TooManyConnections
 from protocol.features import CostModel
+from server.serving import Serving
 
 __all__ = ["Connection", "Connections"]
 
 
 @dataclass(eq=False)
 class Connection:
-    """One engine's link to the server; it alone may name its bots. `costs` are as it declared, then as it measures."""
+    """One engine's link to the server; it alone may name its bots, which are bots of `serving`.
+
+    `costs` are as it declared, then as it measures.
+    """
 
     id: str
+    serving: Serving
     costs: Costs
     last_seen_s: float
     bots: set[int] = field(default_factory=set)
@@ -48,11 +53,11 @@ class Connections:
     def __iter__(self) -> Iterator[Connection]:
         return iter(self._by_id.values())
 
-    def open(self, cost_model: CostModel) -> Connection:
-        """A new connection; raises TooManyConnections."""
+    def open(self, cost_model: CostModel, serving: Serving) -> Connection:
+        """A new connection to bots of `serving`; raises TooManyConnections."""
         if len(self._by_id) >= self._max_connections:
             raise TooManyConnections(f"all {self._max_connections} connections are taken", retry_after_s=1.0)
-        connection = Connection(secrets.token_hex(16), Costs(cost_model), self._clock())
+        connection = Connection(secrets.token_hex(16), serving, Costs(cost_model), self._clock())
         self._by_id[connection.id] = connection
         return connection
 

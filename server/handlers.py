@@ -10,11 +10,10 @@ import hmac
 
 import numpy as np
 
-from bot_runtime.bots import Bots
 from bot_runtime.costs import Report
 from bot_runtime.inputs import check_costs
 from protocol import arrays
-from protocol.codec import Format, body_limit
+from protocol.codec import Format
 from protocol.errors import BadSchema, Unauthorized
 from protocol.features import CostModel
 from protocol.messages import (
@@ -35,20 +34,23 @@ from protocol.messages import (
     Welcome,
 )
 from server.connections import Connection, Connections
+from server.servings import Servings
 
 __all__ = ["Handlers"]
 
 
 class Handlers:
-    """Answers requests of known connections with these bots. `token` is what Hello must carry, if anything."""
+    """Answers requests of known connections with bots of these servings. `token` is what Hello must carry, if any."""
 
-    def __init__(self, bots: Bots, connections: Connections, token: str | None) -> None:
-        self._bots = bots
-        self._manifest = bots.bundle.manifest
-        self._table = self._manifest.features
+    def __init__(self, servings: Servings, connections: Connections, token: str | None) -> None:
+        self.servings = servings
         self._connections = connections
         self._token = token
-        self.max_body_bytes = {form: body_limit(self._table, bots.max_bots, form) for form in Format}
+
+    @property
+    def max_body_bytes(self) -> dict[Format, int]:
+        """The longest message that is read, by format; safe to read from any thread."""
+        return self.servings.max_body_bytes
 
     def handle(self, request: Request, connection_id: str | None, form: Format) -> Reply:
         """The reply to one request, its blobs written for `form`. Raises ProtocolError, having done nothing."""
@@ -72,12 +74,12 @@ class Handlers:
         """End a connection and its bots; one that has ended already is no error."""
         connection = self._connections.remove(connection_id)
         if connection is not None:
-            self._stop(connection, list(connection.bots))
+            self._let_go(connection)
 
     def end_silent(self) -> None:
         """End every connection that has been silent for longer than its time to live."""
         for connection in self._connections.remove_silent():
-            self._stop(connection, list(connection.bots))
+            self._let_go(connection)
 
     def costs(self) -> list[Report]:
         """What acquiring costs each connection's engine, in the order in which they connected."""
@@ -96,28 +98,17 @@ class Handlers:
             raise BadSchema("this socket has said hello already: it carries one connection")
         if hello.protocol != PROTOCOL_VERSION:
             raise BadSchema(f"protocol {hello.protocol} is not spoken here, expected {PROTOCOL_VERSION}")
-        cost_model = hello.cost_model or CostModel.declared(self._table)
-        check_costs(cost_model, self._table)
+        serving = self.servings.default()
+        cost_model = hello.cost_model or CostModel.declared(serving.table)
+        check_costs(cost_model, serving.table)
         self.end_silent()
-        budget_us = cost_model.full_us if self._manifest.is_unlimited else self._manifest.budget_us
-        target_cost = self._manifest.target_cost
-        connection = self._connections.open(cost_model)
-        return Welcome(
-            connection=connection.id,
-            bundle=self._manifest.name,
-            features=self._table,
-            action=self._manifest.action,
-            cost_model=cost_model,
-            budget_us=budget_us,
-            context_length=self._manifest.context_length,
-            max_bots=self._bots.max_bots,
-            max_body_bytes=self.max_body_bytes[form],
-            target_cost_us=None if target_cost is None else target_cost * cost_model.full_us,
-            cost_quantile=connection.costs.quantile,
-        )
+        connection = self._connections.open(cost_model, serving)
+        self.servings.hold(serving)
+        return serving.welcome(connection.id, cost_model, connection.costs.quantile, form)
 
     def _start_bots(self, request: StartBots, connection: Connection) -> BotsStarted:
-        handles = self._bots.start(
+        self.servings.check_room(request.count)
+        handles = connection.serving.bots.start(
             request.count,
             seeds=request.seeds,
             target_returns=request.target_returns,
@@ -130,9 +121,10 @@ class Handlers:
 
     def _request_queries(self, request: RequestQueries, connection: Connection, form: Format) -> Queries:
         connection.check_owns(request.bots)
-        free_NF = arrays.floats(request.free, (len(request.bots), self._table.n_free), "free")
+        serving = connection.serving
+        free_NF = arrays.floats(request.free, (len(request.bots), serving.table.n_free), "free")
         handles_N = np.array(request.bots, dtype=np.int64)
-        turn = self._bots.request_queries(
+        turn = serving.bots.request_queries(
             handles_N,
             request.frame,
             free_NF,
@@ -148,12 +140,13 @@ class Handlers:
 
     def _submit_features(self, request: SubmitFeatures, connection: Connection, form: Format) -> Actions:
         connection.check_owns(request.bots)
-        shape = len(request.bots), self._table.n_queries
+        serving = connection.serving
+        shape = len(request.bots), serving.table.n_queries
         acquired_NM = arrays.bits(request.acquired, shape, "acquired")
         failed_NM = None if request.failed is None else arrays.bits(request.failed, shape, "failed")
-        costly_ND = arrays.unpack_values(request.values, acquired_NM, self._table)
+        costly_ND = arrays.unpack_values(request.values, acquired_NM, serving.table)
         handles_N = np.array(request.bots, dtype=np.int64)
-        turn = self._bots.submit_features(
+        turn = serving.bots.submit_features(
             handles_N, request.frame, acquired_NM, costly_ND, failed_NM, request.acquire_us, connection.costs
         )
         actions = arrays.pack_floats(turn.action_NA, form)
@@ -164,6 +157,11 @@ class Handlers:
         return BotsStopped(count=self._stop(connection, request.bots))
 
     def _stop(self, connection: Connection, handles: list[int]) -> int:
-        stopped = self._bots.stop(np.array(handles, dtype=np.int64)) if handles else 0
+        stopped = connection.serving.bots.stop(np.array(handles, dtype=np.int64)) if handles else 0
         connection.bots.difference_update(handles)
         return stopped
+
+    def _let_go(self, connection: Connection) -> None:
+        """Stop what a connection that is gone has left."""
+        self._stop(connection, list(connection.bots))
+        self.servings.release(connection.serving)

@@ -18,7 +18,6 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from bot_runtime.manifest import Manifest
 from protocol import messages
 from protocol.codec import Format
 from protocol.errors import (
@@ -46,10 +45,9 @@ _BY_STATUS: dict[int, type[ProtocolError]] = {404: NoRoute, 405: MethodNotAllowe
 class HttpDoor:
     """Answers HTTP requests; `ready` is what /readyz says."""
 
-    def __init__(self, handlers: Handlers, worker: Worker, manifest: Manifest, *, body_deadline_s: float) -> None:
+    def __init__(self, handlers: Handlers, worker: Worker, *, body_deadline_s: float) -> None:
         self._handlers = handlers
         self._worker = worker
-        self._summary = summary(manifest)
         self._body_deadline_s = body_deadline_s
         self.ready = True
 
@@ -73,9 +71,10 @@ class HttpDoor:
         """What is served, without a connection; needs the token as `Authorization: Bearer` where there is one."""
         try:
             self._check_bearer(request)
+            serving = await self._worker.run(self._handlers.servings.default)
         except ProtocolError as error:
             return _refused(error, Format.JSON)
-        return Response(self._summary, media_type=Format.JSON.value)
+        return Response(summary(serving.manifest), media_type=Format.JSON.value)
 
     async def costs(self, request: Request) -> Response:
         """What acquiring costs each connected engine, as declared and as measured; needs the token as `bundle` does."""

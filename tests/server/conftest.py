@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from bot_runtime.bundle import Bundle
 from protocol.client import BotClient, Welcome
+from server.serving import Serving
 from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE, WELCOME
 from tests.server.serving import Served, serve
@@ -15,6 +17,12 @@ from tests.server.serving import Served, serve
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny bundle with the golden vectors' features, so that golden frames can be sent to a real server."""
     return make_bundle(tmp_path_factory.mktemp("bundle"), features=TABLE, action=WELCOME.action, budget=0.6)
+
+
+@pytest.fixture(scope="session")
+def serving(bundle: Path) -> Serving:
+    """That bundle in memory, for tests that start no bots."""
+    return Serving(Bundle.load(bundle), max_bots=1)
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from fastapi import FastAPI
 
-from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
 from protocol.errors import BadBundle
 from server import app
@@ -17,6 +16,8 @@ from server.app import _listen, running
 from server.connections import Connections
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
+from server.serving import Serving
+from server.servings import Servings
 from server.settings import Settings
 from server.stream import StreamDoor
 from server.worker import Worker
@@ -48,8 +49,9 @@ def test_http_and_tcp_listen_on_such_sockets(bundle: Path, monkeypatch: pytest.M
 
 def test_a_draining_door_is_alive_and_not_ready(bundle: Path) -> None:
     worker = Worker(1)
-    bots = Bots(Bundle.load(bundle), max_bots=1)
-    door = HttpDoor(Handlers(bots, Connections(1, 1.0), None), worker, bots.bundle.manifest, body_deadline_s=1.0)
+    servings = Servings(max_bots=1)
+    servings.activate(Serving(Bundle.load(bundle), max_bots=1))
+    door = HttpDoor(Handlers(servings, Connections(1, 1.0), None), worker, body_deadline_s=1.0)
     application = create_app(door)
 
     def get(path: str) -> tuple[int, dict[str, Any], dict[bytes, bytes]]:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
 
-from bot_runtime.manifest import Manifest
+from bot_runtime.bundle import Bundle
 from protocol.client import BotClient
 from protocol.codec import Format
 from protocol.errors import BadShape, FrameReused
@@ -17,6 +15,8 @@ from protocol.features import CostModel
 from protocol.messages import Hello
 from server.connections import Connections
 from server.handlers import Handlers
+from server.serving import Serving
+from server.servings import Servings
 from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE
 from tests.server.serving import Served, free_numbers
@@ -26,9 +26,10 @@ SEEDS = [5, 6, 7]
 
 
 def test_without_a_limit_the_budget_is_what_everything_costs_on_this_connection(tmp_path: Path) -> None:
-    manifest = msgspec.json.decode((make_bundle(tmp_path, budget=1.0) / "manifest.json").read_bytes(), type=Manifest)
-    bots = SimpleNamespace(bundle=SimpleNamespace(manifest=manifest), max_bots=1)
-    handlers = Handlers(bots, Connections(2, 1.0), None)
+    serving = Serving(Bundle.load(make_bundle(tmp_path, budget=1.0)), max_bots=1)
+    manifest, servings = serving.manifest, Servings(max_bots=1)
+    servings.activate(serving)
+    handlers = Handlers(servings, Connections(2, 1.0), None)
     model = CostModel(1000.0, (3.0,) * manifest.features.n_queries)
     for hello, full_us in ((Hello(cost_model=model), model.full_us), (Hello(), manifest.budget_us)):
         assert handlers.handle(hello, None, Format.MSGPACK).budget_us == full_us

@@ -5,15 +5,16 @@ import pytest
 from protocol.errors import NoBot, NoConnection, TooManyConnections
 from protocol.features import CostModel
 from server.connections import Connections
+from server.serving import Serving
 from tests.server.serving import FakeClock
 
 COSTS = CostModel(0.0, (1.0,))
 
 
-def test_silence_is_measured_by_the_given_clock_and_any_request_breaks_it() -> None:
+def test_silence_is_measured_by_the_given_clock_and_any_request_breaks_it(serving: Serving) -> None:
     clock = FakeClock()
     connections = Connections(max_connections=3, idle_ttl_s=10.0, clock=clock)
-    silent, talking = connections.open(COSTS), connections.open(COSTS)
+    silent, talking = connections.open(COSTS, serving), connections.open(COSTS, serving)
     for _ in range(5):
         clock.now += 6.0
         assert connections.get(talking.id) is talking
@@ -24,21 +25,21 @@ def test_silence_is_measured_by_the_given_clock_and_any_request_breaks_it() -> N
     assert len(connections) == 1
 
 
-def test_limits_and_names() -> None:
+def test_limits_and_names(serving: Serving) -> None:
     connections = Connections(max_connections=1, idle_ttl_s=10.0, clock=FakeClock())
-    only = connections.open(COSTS)
+    only = connections.open(COSTS, serving)
     with pytest.raises(TooManyConnections):
-        connections.open(COSTS)
+        connections.open(COSTS, serving)
     for name in (None, "", "0" * 32, only.id.upper() + "x"):
         with pytest.raises(NoConnection):
             connections.get(name)
     assert connections.remove(only.id) is only
     assert connections.remove(only.id) is None
-    assert connections.open(COSTS).id != only.id
+    assert connections.open(COSTS, serving).id != only.id
 
 
-def test_a_connection_names_its_own_bots() -> None:
-    connection = Connections(1, 10.0, FakeClock()).open(COSTS)
+def test_a_connection_names_its_own_bots(serving: Serving) -> None:
+    connection = Connections(1, 10.0, FakeClock()).open(COSTS, serving)
     connection.bots.update({3, 4})
     connection.check_owns([4, 3])
     with pytest.raises(NoBot, match="5"):

@@ -1,0 +1,77 @@
+"""Servings: the active bundle of each name, and earlier ones that connections still hold.
+
+This module knows nothing about files, messages or transports. It belongs to the worker; only `max_body_bytes`, which
+is replaced whole, may be read from elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from protocol.codec import Format
+from protocol.errors import TooManyBots
+from server.serving import Serving
+
+__all__ = ["Servings"]
+
+
+class Servings:
+    """Every bundle in memory. All of them together serve at most `max_bots` bots.
+
+    A connection holds the serving that it was opened with, so that what it was told stays true; a serving that is no
+    longer active is forgotten with its last connection.
+    """
+
+    def __init__(self, max_bots: int) -> None:
+        self._active: dict[str, Serving] = {}
+        self._loaded: list[Serving] = []
+        self._max_bots = max_bots
+        self.max_body_bytes = dict.fromkeys(Format, 0)
+
+    def __iter__(self) -> Iterator[Serving]:
+        return iter(tuple(self._loaded))
+
+    @property
+    def n_bots(self) -> int:
+        """How many bots there are, of all bundles."""
+        return sum(serving.bots.n_bots for serving in self._loaded)
+
+    def default(self) -> Serving:
+        """What a hello that names no bundle gets."""
+        (only,) = self._active.values()
+        return only
+
+    def activate(self, serving: Serving) -> None:
+        """From now on new connections get this one where they would have got the one of the same name."""
+        replaced = self._active.get(serving.name)
+        self._active[serving.name] = serving
+        self._loaded.append(serving)
+        if replaced is not None:
+            self._forget_unused(replaced)
+        self._limit_bodies()
+
+    def hold(self, serving: Serving) -> None:
+        """One more connection holds this."""
+        serving.n_connections += 1
+
+    def release(self, serving: Serving) -> None:
+        """A connection lets go of this, its bots stopped."""
+        serving.n_connections -= 1
+        self._forget_unused(serving)
+
+    def check_room(self, count: int) -> None:
+        """Raise TooManyBots unless so many more bots may be started."""
+        n_bots = self.n_bots
+        if n_bots + count > self._max_bots:
+            raise TooManyBots(
+                f"{count} bots do not fit: {n_bots} of {self._max_bots} slots are taken", retry_after_s=1.0
+            )
+
+    def _forget_unused(self, serving: Serving) -> None:
+        if serving.n_connections == 0 and self._active.get(serving.name) is not serving:
+            self._loaded.remove(serving)
+            self._limit_bodies()
+
+    def _limit_bodies(self) -> None:
+        """The longest message that any of them can make sense of: whose it is, is known only once it is read."""
+        self.max_body_bytes = {form: max(serving.max_body_bytes[form] for serving in self._loaded) for form in Format}

@@ -1,0 +1,94 @@
+"""What is in memory: the active serving of a name, and earlier ones for as long as connections hold them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bot_runtime.bundle import Bundle
+from protocol.codec import Format
+from protocol.errors import TooManyBots
+from protocol.messages import Goodbye, Hello, RequestQueries, StartBots, StopBots
+from server.connections import Connections
+from server.handlers import Handlers
+from server.serving import Serving
+from server.servings import Servings
+from tests.bundles import make_bundle
+from tests.server.serving import FakeClock
+
+FORM = Format.MSGPACK
+
+
+@pytest.fixture(scope="module")
+def versions(tmp_path_factory: pytest.TempPathFactory) -> list[Bundle]:
+    """Three bundles of one name and one interface, with different weights."""
+    folder = tmp_path_factory.mktemp("versions")
+    return [Bundle.load(make_bundle(folder / str(seed), seed=seed)) for seed in range(3)]
+
+
+def _served(*bundles: Bundle, max_bots: int = 8, clock: FakeClock | None = None) -> tuple[Handlers, Servings]:
+    servings = Servings(max_bots)
+    for bundle in bundles:
+        servings.activate(Serving(bundle, max_bots=max_bots))
+    return Handlers(servings, Connections(4, 60.0, clock or FakeClock()), None), servings
+
+
+def test_a_new_connection_gets_the_active_one_and_an_old_one_keeps_its_own(versions: list[Bundle]) -> None:
+    handlers, servings = _served(versions[0])
+    old = servings.default()
+    first = handlers.handle(Hello(), None, FORM).connection
+    bots = handlers.handle(StartBots(2, seeds=[1, 2]), first, FORM).bots
+    new = Serving(versions[1], max_bots=8)
+    servings.activate(new)
+    assert servings.default() is new
+    assert set(servings) == {old, new}
+    second = handlers.handle(Hello(), None, FORM).connection
+    handlers.handle(StartBots(1), second, FORM)
+    assert (old.bots.n_bots, new.bots.n_bots, servings.n_bots) == (2, 1, 3)
+    free = np.zeros((2, old.table.n_free), dtype="<f4").tobytes()
+    handlers.handle(RequestQueries(0, bots, free), first, FORM)
+    handlers.handle(StopBots(bots), first, FORM)
+    assert set(servings) == {old, new}
+    handlers.handle(Goodbye(), first, FORM)
+    assert set(servings) == {new}
+
+
+def test_an_old_one_is_forgotten_with_its_last_connection_however_that_ends(versions: list[Bundle]) -> None:
+    clock = FakeClock()
+    handlers, servings = _served(versions[0], clock=clock)
+    silent, closed = (handlers.handle(Hello(), None, FORM).connection for _ in range(2))
+    handlers.handle(StartBots(3), silent, FORM)
+    servings.activate(Serving(versions[1], max_bots=8))
+    handlers.end(closed)
+    handlers.end(closed)
+    assert len(list(servings)) == 2
+    clock.now += 61.0
+    handlers.end_silent()
+    assert [serving.bots.bundle for serving in servings] == [versions[1]]
+    assert servings.n_bots == 0
+
+
+def test_one_that_nobody_holds_is_forgotten_when_it_is_replaced(versions: list[Bundle]) -> None:
+    _, servings = _served(*versions)
+    assert [serving.bots.bundle for serving in servings] == [versions[2]]
+
+
+def test_max_bots_counts_the_bots_of_all_of_them(versions: list[Bundle]) -> None:
+    handlers, servings = _served(versions[0], max_bots=3)
+    first = handlers.handle(Hello(), None, FORM).connection
+    handlers.handle(StartBots(2), first, FORM)
+    servings.activate(Serving(versions[1], max_bots=3))
+    second = handlers.handle(Hello(), None, FORM).connection
+    with pytest.raises(TooManyBots, match="2 bots do not fit: 2 of 3"):
+        handlers.handle(StartBots(2), second, FORM)
+    handlers.handle(StartBots(1), second, FORM)
+    with pytest.raises(TooManyBots):
+        handlers.handle(StartBots(1), first, FORM)
+
+
+def test_the_longest_message_is_that_of_whatever_is_in_memory(versions: list[Bundle], serving: Serving) -> None:
+    handlers, servings = _served(versions[0], max_bots=8)
+    small, large = serving.max_body_bytes, servings.default().max_body_bytes
+    assert all(small[form] < large[form] == handlers.max_body_bytes[form] for form in Format)
+    servings.activate(serving)
+    assert handlers.max_body_bytes == small
