@@ -105,6 +105,13 @@ class Batch:
         if self.copies is not None:
             np.take(self.arena.before, self.slots_N, axis=0, out=self.before_NX, mode="clip")
 
+    def begin(self, free_NF: _Floats, returns_to_go_N: NDArray[np.float64], target_cost_N: NDArray[np.float32]) -> None:
+        """Write all that the acquisition graph reads: each bot's past and, of this turn, what is known before it."""
+        self.fetch_past()
+        self.free_NF[...] = free_NF
+        self.left_N1[:, 0] = returns_to_go_N
+        self.target_cost_N1[:, 0] = target_cost_N
+
     def keep_prepared(self) -> None:
         """Make what the acquisition graph prepared the bots' own."""
         self.arena.prepared[self.at] = self.asked_NE

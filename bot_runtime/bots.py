@@ -9,20 +9,22 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bot_runtime import inputs
-from bot_runtime.batch import Batch
 from bot_runtime.bundle import Bundle
 from bot_runtime.company import Companies, Company, Means
 from bot_runtime.context import Contexts
 from bot_runtime.costs import MAX_ACQUIRE_US, Costs
-from bot_runtime.fallback import Counters, fallback_actions
+from bot_runtime.draw import draw
+from bot_runtime.fallback import Counters
 from bot_runtime.policy import Policy
 from bot_runtime.slots import Slots
 from bot_runtime.spending import Limits, Spending
+from bot_runtime.step import Step
 from bot_runtime.turns import Actions, Queries, Turn, Turns
 from protocol.errors import BadSchema, FrameReused
 from protocol.features import CostModel
@@ -61,11 +63,11 @@ class Bots:
         self._slots = Slots(max_bots, first_generation=generation)
         self._contexts = Contexts(bundle.manifest, max_bots)
         self._turns = Turns(max_bots, self.counters)
+        self._step = Step(bundle.manifest, self._contexts, self.counters, clock)
         self._spending = Spending(bundle.manifest, max_bots)
         self._companies = Companies(self._slots, self._contexts, self._spending)
         self._checks = inputs.FeatureChecks(bundle.manifest.features, max_bots)
         self._started = 0
-        self._low_A, self._high_A = bundle.manifest.action.range
 
     @property
     def n_bots(self) -> int:
@@ -182,7 +184,7 @@ class Bots:
             _check_same((staged_ND, known_NM, measured_us), kept, frame)
             return turn.actions
         np.copyto(batch.query_NM, known_NM)
-        turn.actions, turn.measured_us = self._act(turn, batch), measured_us
+        turn.actions, turn.measured_us = self._step.act(self._policy, turn, batch), measured_us
         batch.keep_acquired()
         if acquire_us is not None and costs is not None:
             costs.observe(acquired_NM, acquire_us)
@@ -205,74 +207,22 @@ class Bots:
         self,
         company: Company,
         frame: int,
-        request: tuple[NDArray[np.generic], ...],
+        request: tuple[NDArray[Any], ...],
         returns_to_go_N: NDArray[np.float64],
         means: Means,
         frame_budget_us: float | None,
     ) -> Turn:
         """Compute a turn's first half without changing any bot."""
         batch, n_queries = company.batch, self.bundle.manifest.features.n_queries
-        batch.fetch_past()
-        batch.free_NF[...] = request[0]
-        batch.left_N1[:, 0] = returns_to_go_N
-        batch.target_cost_N1[:, 0] = means.terms.target_cost_N
-        started_ns = self._clock()
-        self._policy.query_probs(batch)
-        infer_us = (self._clock() - started_ns) / 1e3
-        probs_NM, noise = batch.probs_NM.copy(), self._contexts.noise(batch)
-        query_NM = noise[:, :n_queries] < probs_NM
-        finite_NM, asks_N = np.isfinite(probs_NM), None
-        if np.count_nonzero(finite_NM) < finite_NM.size:
-            asks_N = np.logical_and.reduce(finite_NM, axis=1)
-            query_NM &= asks_N[:, None]
-        query_NM, cost_us_N = means.fit(probs_NM, query_NM, frame_budget_us)
-        _freeze(query_NM, cost_us_N, probs_NM)
-        queries = Queries(frame, query_NM, cost_us_N, probs_NM, infer_us)
-        return Turn(frame, company.handles_N, request, queries, noise[:, n_queries:], asks_N)
-
-    def _act(self, turn: Turn, batch: Batch) -> Actions:
-        """A turn's second half: act, then advance the contexts of those bots whose step is finite."""
-        batch.fetch_context()
-        if self.bundle.manifest.samples_action:
-            np.copyto(batch.noise_NA, turn.noise_NA)
-        started_ns = self._clock()
-        self._policy.act(batch)
-        infer_us = (self._clock() - started_ns) / 1e3
-        # A Gaussian head may overshoot; what leaves is within the action that the bundle declares.
-        action_NA = np.maximum(batch.action_NA, self._low_A)
-        np.minimum(action_NA, self._high_A, out=action_NA)
-        if batch.is_finite and turn.asks_N is None:
-            reasons_N = np.zeros(batch.n_bots, dtype=np.uint8)  # all learned
-            self._contexts.advance(batch, action_NA)
-            self.counters.count_learned(batch.n_bots)
-        else:
-            action_NA, reasons_N = self._fall_back(turn, batch, action_NA)
-            self.counters.count(reasons_N)
-        _freeze(action_NA, reasons_N)
-        return Actions(turn.frame, action_NA, reasons_N, infer_us)
-
-    def _fall_back(
-        self, turn: Turn, batch: Batch, learned_NA: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """The actions and their reasons where not everything was finite; only contexts whose step was are advanced."""
-        contexts, usable_N = self._contexts, batch.finite_N
-        action_NA, reasons_N = fallback_actions(
-            learned_NA,
-            usable_N,
-            np.zeros(batch.n_bots, dtype=np.bool_) if turn.asks_N is None else ~turn.asks_N,
-            contexts.last_action(batch),
-            contexts.turns(batch) > 0,
-            self.bundle.manifest.action.safe,
-        )
-        contexts.advance(batch, action_NA, usable_N)
-        return action_NA, reasons_N
+        batch.begin(request[0], returns_to_go_N, means.terms.target_cost_N)
+        noise_NX = self._contexts.noise(batch)
+        drawn = draw(self._policy, batch, noise_NX, means, frame_budget_us, self._clock)
+        for array in (drawn.query_NM, drawn.cost_us_N, drawn.probs_NM):
+            array.flags.writeable = False
+        queries = Queries(frame, drawn.query_NM, drawn.cost_us_N, drawn.probs_NM, drawn.infer_us)
+        return Turn(frame, company.handles_N, request, queries, noise_NX[:, n_queries:], drawn.asks_N)
 
 
 def _check_same(content: tuple[NDArray[np.generic], ...], kept: tuple[NDArray[np.generic], ...], frame: int) -> None:
     if not all(np.array_equal(new, old) for new, old in zip(content, kept, strict=True)):
         raise FrameReused(f"frame {frame} was sent before with other content")
-
-
-def _freeze(*arrays: NDArray[np.generic]) -> None:
-    for array in arrays:
-        array.flags.writeable = False

@@ -1,0 +1,73 @@
+"""A draw: what N bots ask for in one frame, before anyone has answered.
+
+This module knows nothing about handles, turns or messages. The server's bots and an engine's own head draw by the same
+function, so that they ask the same questions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bot_runtime.batch import Batch
+from bot_runtime.company import Means
+
+__all__ = ["Asker", "Draw", "asking", "draw", "timed_us"]
+
+
+class Asker(Protocol):
+    """Whatever runs the acquisition graph."""
+
+    def query_probs(self, batch: Batch) -> None:
+        """From `before_NX` and `target_cost_N1` to `probs_NM` and `asked_NE`."""
+
+
+class Draw(NamedTuple):
+    """What each bot asks for, its predicted cost in µs, the Bernoulli means it was drawn from, and µs of inference.
+
+    `asks_N` says whose means were finite; None: everyone's.
+    """
+
+    query_NM: NDArray[np.bool_]
+    cost_us_N: NDArray[np.float64]
+    probs_NM: NDArray[np.float32]
+    asks_N: NDArray[np.bool_] | None
+    infer_us: float
+
+
+def draw(
+    asker: Asker,
+    batch: Batch,
+    noise_NX: NDArray[np.float32],
+    means: Means,
+    frame_budget_us: float | None,
+    clock: Callable[[], int],
+) -> Draw:
+    """Run the graph over a batch whose inputs are written, sample by the first M numbers of its noise, and allocate."""
+    infer_us = timed_us(clock, asker.query_probs, batch)
+    probs_NM = batch.probs_NM.copy()
+    query_NM = noise_NX[:, : probs_NM.shape[1]] < probs_NM
+    asks_N = asking(probs_NM)
+    if asks_N is not None:
+        query_NM &= asks_N[:, None]
+    query_NM, cost_us_N = means.fit(probs_NM, query_NM, frame_budget_us)
+    return Draw(query_NM, cost_us_N, probs_NM, asks_N, infer_us)
+
+
+def asking(probs_NM: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+    """Whose means are finite, [N]; None where everyone's are."""
+    finite_NM = np.isfinite(probs_NM)
+    if np.count_nonzero(finite_NM) == finite_NM.size:
+        return None
+    asks_N: NDArray[np.bool_] = np.logical_and.reduce(finite_NM, axis=1)
+    return asks_N
+
+
+def timed_us(clock: Callable[[], int], run: Callable[[Batch], None], batch: Batch) -> float:
+    """Run a graph; how many µs that took by a clock that counts ns."""
+    started_ns = clock()
+    run(batch)
+    return (clock() - started_ns) / 1e3
