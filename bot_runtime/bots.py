@@ -24,6 +24,7 @@ from bot_runtime.fallback import Counters
 from bot_runtime.policy import Policy
 from bot_runtime.slots import Slots
 from bot_runtime.spending import Limits, Spending
+from bot_runtime.spent import Spent
 from bot_runtime.step import Step
 from bot_runtime.turns import Actions, Queries, Turn, Turns
 from protocol.errors import BadSchema, FrameReused
@@ -43,7 +44,7 @@ class Bots:
 
     Every refused call (any ProtocolError) leaves every bot exactly as it was. A repeated request with the same content
     gets the same reply object again and advances nothing; replies are read-only arrays. `counters` says how often
-    each rung of the fallback ladder was used.
+    each rung of the fallback ladder was used, `spent` what was asked for and what it really cost.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Bots:
         """`clock` counts ns. `first_generation` of the handles are random by default: none outlives a process."""
         self.bundle = bundle
         self.counters = Counters()
+        self.spent = Spent()
         self._clock = clock
         self._policy = Policy(bundle)
         generation = secrets.randbits(31) if first_generation is None else first_generation
@@ -152,6 +154,7 @@ class Bots:
         self._contexts.spend(company.batch, returns_to_go_N)
         company.batch.keep_prepared()
         self._turns.begin(company, turn)
+        self.spent.ask(turn.queries.cost_us_N, min(means.allowed_us, turn.budget_us))
         return turn.queries
 
     def submit_features(
@@ -187,7 +190,9 @@ class Bots:
         turn.actions, turn.measured_us = self._step.act(self._policy, turn, batch), measured_us
         batch.keep_acquired()
         if acquire_us is not None and costs is not None:
-            costs.observe(acquired_NM, acquire_us)
+            predicted_us = costs.observe(acquired_NM, acquire_us)
+            if predicted_us is not None:
+                self.spent.measure(acquire_us, predicted_us, turn.budget_us)
         return turn.actions
 
     def stop(self, handles: _Handles) -> int:
@@ -220,7 +225,8 @@ class Bots:
         for array in (drawn.query_NM, drawn.cost_us_N, drawn.probs_NM):
             array.flags.writeable = False
         queries = Queries(frame, drawn.query_NM, drawn.cost_us_N, drawn.probs_NM, drawn.infer_us)
-        return Turn(frame, company.handles_N, request, queries, noise_NX[:, n_queries:], drawn.asks_N)
+        budget_us = means.budget_us if frame_budget_us is None else min(means.budget_us, frame_budget_us)
+        return Turn(frame, company.handles_N, request, queries, noise_NX[:, n_queries:], drawn.asks_N, budget_us)
 
 
 def _check_same(content: tuple[NDArray[np.generic], ...], kept: tuple[NDArray[np.generic], ...], frame: int) -> None:

@@ -36,12 +36,22 @@ class Means:
     terms: Terms
     ample_N: _Floats
     calls_cost: bool  # whether any call does
+    budget_us: float  # of all bots together; infinite where any has none
+    allowed_us: float  # the same, never more than everything costs
     room_NM: _Floats  # for what `fit` computes on the way
 
     @classmethod
     def of(cls, terms: Terms) -> Means:
         """What follows from a frame's terms."""
-        return cls(terms, terms.budgets_N * _AMPLE, bool(terms.calls_N.any()), np.empty_like(terms.costs_NM))
+        budgets_N = terms.budgets_N
+        return cls(
+            terms,
+            budgets_N * _AMPLE,
+            bool(terms.calls_N.any()),
+            sum(budgets_N.tolist()),
+            sum(np.minimum(budgets_N, terms.full_N).tolist()),
+            np.empty_like(terms.costs_NM),
+        )
 
     def fit(
         self, probs_NM: NDArray[np.float32], sampled_NM: NDArray[np.bool_], frame_budget_us: float | None

@@ -96,15 +96,19 @@ class Costs:
         self._sums = [0.0, 0.0, 0.0, 0.0]
         self._within, self._log_margin = within, 0.0
 
-    def observe(self, acquired_NM: NDArray[np.bool_], acquire_us: float) -> None:
-        """Acquiring this took so many µs. Where nothing was acquired, or the number is none, nothing is learned."""
+    def observe(self, acquired_NM: NDArray[np.bool_], acquire_us: float) -> float | None:
+        """Acquiring this took so many µs; returns how many had been predicted.
+
+        Where nothing was acquired, or the number is none, nothing is learned, and it returns None.
+        """
         counts_M, calls = np.ones(len(acquired_NM)) @ acquired_NM, int(np.count_nonzero(acquired_NM.any(axis=1)))
         parts: list[float] = [calls * self._unit_us, *(counts_M @ self._declared_MG).tolist()]
         scale_us = sum(parts)
         if not (scale_us > 0.0 and 0.0 <= acquire_us <= MAX_ACQUIRE_US):
-            return
+            return None
         expected_us = max(_dot(parts, self._shape), scale_us / self._within)
-        is_over = acquire_us > _dot(parts, self._charged)
+        predicted_us = _dot(parts, self._charged)
+        is_over = acquire_us > predicted_us
         self.n_frames += 1
         self.n_over += is_over
         self._counts_M += counts_M
@@ -114,6 +118,7 @@ class Costs:
         self._log_margin = min(max(self._log_margin + _STEP * step, -bound), bound)
         self._fit(parts, scale_us, min(max(acquire_us, expected_us / 2.0), expected_us * 2.0))
         self._charge()
+        return predicted_us
 
     def _fit(self, parts: list[float], scale_us: float, measured_us: float) -> None:
         row_P, measured = np.array(parts) / scale_us, measured_us / scale_us

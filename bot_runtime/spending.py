@@ -51,7 +51,7 @@ class Limits(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """What counts for N bots in one frame: costs [N, M], call costs [N] and budgets [N] in µs; target costs [N].
+    """What counts for N bots in one frame: in µs costs [N, M], of calls, budgets, of everything; target costs [N].
 
     Budgets are infinite where there is none. Target costs are shares of each bot's full cost, within [0, 1].
     """
@@ -59,6 +59,7 @@ class Terms(NamedTuple):
     costs_NM: _Floats
     calls_N: _Floats
     budgets_N: _Floats
+    full_N: _Floats
     target_cost_N: NDArray[np.float32]
 
 
@@ -104,7 +105,7 @@ class Spending:
             costs_NM = np.repeat(measured.costs_M[None], slots_N.size, axis=0)
             calls_N, full_N = np.full(slots_N.size, measured.call_us), np.full(slots_N.size, measured.full_us)
         share_N = self._shares(slots_N, said, budgets_N, full_N) if self._is_conditioned else np.zeros(slots_N.size)
-        return Terms(costs_NM, calls_N, budgets_N, share_N.astype(np.float32))
+        return Terms(costs_NM, calls_N, budgets_N, full_N, share_N.astype(np.float32))
 
     def _shares(self, slots_N: NDArray[np.int64], said: Limits, budgets_N: _Floats, full_N: _Floats) -> _Floats:
         target_us_N = np.minimum(_first(said.targets_N, said.budgets_N, self._targets_B[slots_N]), budgets_N)

@@ -53,6 +53,7 @@ class Turn:
     queries: Queries
     noise_NA: NDArray[np.float32]
     asks_N: NDArray[np.bool_] | None  # whose query_probs were finite; None: everyone's
+    budget_us: float  # of all of its bots together, infinite where any has none
     actions: Actions | None = None
     measured_us: NDArray[np.float64] = field(
         default_factory=lambda: np.zeros(0)

@@ -28,7 +28,7 @@ def test_what_fits_is_what_allocate_leaves(shared: bool) -> None:
         budgets = exact * random.choice([0.0, 0.5, 1.0, 1.0 + 1e-15, 1.0 + 1e-7, 3.0], n_bots)
         budgets[random.random(n_bots) < 0.3] = np.inf
         frame = float(exact.sum() * random.choice([0.0, 0.5, 1.0, 1.0 + 1e-7, 2.0])) if shared else None
-        means = Means.of(Terms(costs, calls, budgets, np.zeros(n_bots, dtype=np.float32)))
+        means = Means.of(Terms(costs, calls, budgets, costs.sum(axis=1) + calls, np.zeros(n_bots, dtype=np.float32)))
         expected = allocate(probs, sampled, costs, calls, budgets, frame)
         query, cost_us = means.fit(probs, sampled.copy(), frame)
         assert np.array_equal(query, expected)
