@@ -42,11 +42,15 @@ class _Version(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Bundle:
-    """The manifest and the verified bytes of both graphs. Nothing is read from disk after `load`."""
+    """The manifest and the verified bytes of both graphs. Nothing is read from disk after `load`.
+
+    `sha256` is of the manifest, which has the hashes of the other files: it names the whole content.
+    """
 
     manifest: Manifest
     acquisition: bytes
     action: bytes
+    sha256: str
 
     @property
     def name(self) -> str:
@@ -62,25 +66,25 @@ class Bundle:
         long their turn takes (`clock` counts ns), and (unless `replay` is false) the golden episode. Raises BadBundle
         naming the file, what was expected and what was found.
         """
-        manifest = _read_manifest(path / MANIFEST_FILE)
+        read = _read(path / MANIFEST_FILE, MAX_MANIFEST_BYTES)
+        manifest = _read_manifest(read)
         contents = {file: _read_verified(path / file, manifest.files[file]) for file in FILES}
-        bundle = cls(manifest, contents["acquisition.onnx"], contents["action.onnx"])
+        bundle = cls(manifest, contents["acquisition.onnx"], contents["action.onnx"], hashlib.sha256(read).hexdigest())
         check_graph("acquisition.onnx", bundle.acquisition)
         check_graph("action.onnx", bundle.action)
         _verify_behaviour(bundle, contents["golden.npz"], with_replay=replay, clock=clock)
         return bundle
 
 
-def _read_manifest(path: Path) -> Manifest:
-    content = _read(path, MAX_MANIFEST_BYTES)
+def _read_manifest(content: bytes) -> Manifest:
     try:
         version = msgspec.json.decode(content, type=_Version).schema_version
         if version != SCHEMA_VERSION:
             expected = f"expected {SCHEMA_VERSION}: export the run again"
-            raise BadBundle(f"{path.name} has schema_version {version}, {expected}")
+            raise BadBundle(f"{MANIFEST_FILE} has schema_version {version}, {expected}")
         return msgspec.json.decode(content, type=Manifest)
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise BadBundle(f"{path.name}: {error}") from error
+        raise BadBundle(f"{MANIFEST_FILE}: {error}") from error
 
 
 def _read_verified(path: Path, entry: FileEntry) -> bytes:

@@ -16,7 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from protocol.errors import BadShape, NoConnection, ProtocolError
 from protocol.features import CostModel
-from protocol.replies import Actions, Queries, Welcome, read_actions, read_queries, read_reply, read_welcome
+from protocol.replies import (
+    Actions,
+    Queries,
+    Welcome,
+    read_actions,
+    read_bots_started,
+    read_queries,
+    read_reply,
+    read_welcome,
+)
 from protocol.transport import ReplyError, open_transport
 
 __all__ = ["Actions", "BotClient", "Queries", "ReplyError", "Welcome"]
@@ -42,14 +51,29 @@ class BotClient:
     ) -> None:
         self.close()
 
-    def hello(self, *, cost_model: CostModel | None = None, token: str | None = None) -> Welcome:
-        """Open a connection, with the engine's own cost model if it has measured one."""
+    @property
+    def welcome(self) -> Welcome:
+        """What counts for this connection, with the version of the bots that were started last; raises NoConnection."""
+        if self._welcome is None:
+            raise NoConnection("say hello first")
+        return self._welcome
+
+    def hello(
+        self, *, cost_model: CostModel | None = None, token: str | None = None, bundle: str | None = None
+    ) -> Welcome:
+        """Open a connection, with the engine's own cost model if it has measured one.
+
+        `bundle` is a name, of which bots are started on the version that is then active, or NAME@VERSION, of that
+        version only.
+        """
         self._welcome = None
         message: dict[str, Any] = {"type": "hello", "protocol": 1}
         if cost_model is not None:
             message["cost_model"] = _cost_model_dict(cost_model)
         if token is not None:
             message["token"] = token
+        if bundle is not None:
+            message["bundle"] = bundle
         self._welcome = read_welcome(self.exchange(message))
         return self._welcome
 
@@ -69,7 +93,8 @@ class BotClient:
         _add_numbers(message, "target_returns", target_returns)
         _add_numbers(message, "budgets_us", budgets_us)
         _add_numbers(message, "target_costs_us", target_costs_us)
-        return np.array(self.exchange(message)["bots"], dtype=np.int64)
+        handles_N, self._welcome = read_bots_started(self.exchange(message), self.welcome)
+        return handles_N
 
     def query(
         self,
@@ -86,7 +111,7 @@ class BotClient:
         `frame_budget_us` is shared by all these bots, on top of each bot's own budget. `budgets_us` and
         `target_costs_us` [N] replace those of the bots' start for this frame only. Raises BadShape locally too.
         """
-        table = self._connected().features
+        table = self.welcome.features
         handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
         free_NF = _matrix(free, "<f4", (len(handles), table.n_free), "free")
         message = {"type": "request_queries", "frame": int(frame), "bots": handles, "free": free_NF.tobytes()}
@@ -112,7 +137,7 @@ class BotClient:
         the acquired numbers are read and sent. `acquire_us` is what acquiring all of this took: the server then keeps
         budgets by what it measures, if its welcome has a `cost_quantile`. Raises BadShape locally too.
         """
-        welcome = self._connected()
+        welcome = self.welcome
         table = welcome.features
         handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
         acquired_NM = _matrix(acquired, "?", (len(handles), table.n_queries), "acquired")
@@ -154,11 +179,6 @@ class BotClient:
             self._transport.close()
             raise ReplyError(f"the reply is for frame {reply.get('frame')!r}, expected {message['frame']}")
         return reply
-
-    def _connected(self) -> Welcome:
-        if self._welcome is None:
-            raise NoConnection("say hello first")
-        return self._welcome
 
 
 def _cost_model_dict(cost_model: CostModel) -> dict[str, Any]:

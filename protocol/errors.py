@@ -20,6 +20,7 @@ __all__ = [
     "MethodNotAllowed",
     "MissingFeature",
     "NoBot",
+    "NoBundle",
     "NoConnection",
     "NoPendingQuery",
     "NoRoute",
@@ -75,6 +76,12 @@ class Unauthorized(ProtocolError):
     """The token is missing or wrong."""
 
     code, status = "UNAUTHORIZED", 401
+
+
+class NoBundle(ProtocolError):
+    """No such bundle is served, or several are and none was named."""
+
+    code, status = "NO_BUNDLE", 404
 
 
 class NoBot(ProtocolError):

@@ -53,6 +53,8 @@ _Handle = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _Handles = Annotated[list[_Handle], Meta(min_length=1, max_length=MAX_BOTS_PER_MESSAGE)]
 _PerBot = Annotated[list[float], Meta(max_length=MAX_BOTS_PER_MESSAGE)]
 _Token = Annotated[str, Meta(max_length=1024)]
+_BundleName = Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9_-]{0,63}(@[1-9][0-9]{0,8})?$", max_length=74)]
+_Version = Annotated[int, Meta(ge=1)]
 
 
 class _Message(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type"):
@@ -60,11 +62,15 @@ class _Message(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type"
 
 
 class Hello(_Message, frozen=True, tag="hello"):
-    """Open a connection. `cost_model` is the engine's own measurement; without it the bundle's declared costs count."""
+    """Open a connection. `cost_model` is the engine's own measurement; without it the bundle's declared costs count.
+
+    `bundle` is the name of what to be served, `NAME@VERSION` for that version alone; null where there is only one.
+    """
 
     protocol: int = PROTOCOL_VERSION
     cost_model: CostModel | None = None
     token: _Token | None = None
+    bundle: _BundleName | None = None
 
 
 class Welcome(_Message, frozen=True, tag="welcome"):
@@ -72,7 +78,8 @@ class Welcome(_Message, frozen=True, tag="welcome"):
 
     `budget_us` is a bot's default budget, `target_cost_us` its default target cost, null where the bundle has none.
     `cost_quantile` is how often acquiring is to take no longer than predicted, once it is measured; null where a
-    server takes no measurements.
+    server takes no measurements. `bundle_version` is null where the server has no store of versions; `bundle_sha256` is
+    of the bundle's manifest, which has the hashes of its other files.
     """
 
     connection: str
@@ -86,6 +93,8 @@ class Welcome(_Message, frozen=True, tag="welcome"):
     max_body_bytes: int
     target_cost_us: float | None = None
     cost_quantile: float | None = None
+    bundle_version: _Version | None = None
+    bundle_sha256: str | None = None
 
 
 class StartBots(_Message, frozen=True, tag="start_bots"):
@@ -99,9 +108,11 @@ class StartBots(_Message, frozen=True, tag="start_bots"):
 
 
 class BotsStarted(_Message, frozen=True, tag="bots_started"):
-    """Opaque 63-bit handles, in the order of the request."""
+    """Opaque 63-bit handles, in the order of the request, and what these bots are of, as in Welcome."""
 
     bots: list[_Handle]
+    bundle_version: _Version | None = None
+    bundle_sha256: str | None = None
 
 
 class RequestQueries(_Message, frozen=True, tag="request_queries"):

@@ -18,7 +18,16 @@ from protocol.errors import ERRORS_BY_CODE, InternalError, ProtocolError
 from protocol.features import ActionComponent, ActionSpec, CostModel, Feature, FeatureTable
 from protocol.transport import ReplyError
 
-__all__ = ["Actions", "Queries", "Welcome", "read_actions", "read_queries", "read_reply", "read_welcome"]
+__all__ = [
+    "Actions",
+    "Queries",
+    "Welcome",
+    "read_actions",
+    "read_bots_started",
+    "read_queries",
+    "read_reply",
+    "read_welcome",
+]
 
 _MAX_ARRAY = 65536  # msgpack reserves memory for the length that an array claims, at every depth
 _REPLY_TO = {
@@ -35,7 +44,8 @@ class Welcome(NamedTuple):
     """What the server answers to hello: its bundle's features, action, costs and limits.
 
     `target_cost_us` is None where the bundle is not conditioned on its budget, and `cost_quantile` where the server
-    takes no measurements; both from a server that is older than the field.
+    takes no measurements; both from a server that is older than the field. `bundle_version` is None where the server
+    keeps no versions; `bundle_sha256`, the hash of the manifest, only from an older server.
     """
 
     connection: str
@@ -49,6 +59,8 @@ class Welcome(NamedTuple):
     max_body_bytes: int
     target_cost_us: float | None = None
     cost_quantile: float | None = None
+    bundle_version: int | None = None
+    bundle_sha256: str | None = None
 
 
 class Queries(NamedTuple):
@@ -99,7 +111,14 @@ def read_welcome(reply: dict[str, Any]) -> Welcome:
             max_body_bytes=int(reply["max_body_bytes"]),
             target_cost_us=None if target_cost_us is None else float(target_cost_us),
             cost_quantile=None if cost_quantile is None else float(cost_quantile),
+            **_read_version(reply),
         )
+
+
+def read_bots_started(reply: dict[str, Any], welcome: Welcome) -> tuple[NDArray[np.int64], Welcome]:
+    """The handles of a `bots_started`, and `welcome` with the version that these bots are of; raises ReplyError."""
+    with _reading("start_bots"):
+        return np.array(reply["bots"], dtype=np.int64), welcome._replace(**_read_version(reply))
 
 
 def read_queries(reply: dict[str, Any], bots: int, table: FeatureTable) -> Queries:
@@ -117,6 +136,14 @@ def read_actions(reply: dict[str, Any], bots: int, action: ActionSpec) -> Action
         actions_NA = np.frombuffer(reply["actions"], dtype="<f4").reshape(bots, action.size)
         reasons_N = np.array(reply["reasons"], dtype=np.uint8).reshape(bots)
         return Actions(int(reply["frame"]), actions_NA, reasons_N, float(reply["infer_us"]))
+
+
+def _read_version(reply: dict[str, Any]) -> dict[str, Any]:
+    version, sha256 = reply.get("bundle_version"), reply.get("bundle_sha256")
+    return {
+        "bundle_version": None if version is None else int(version),
+        "bundle_sha256": None if sha256 is None else str(sha256),
+    }
 
 
 def _known(kind: type[Feature | ActionComponent], fields: dict[str, Any]) -> dict[str, Any]:

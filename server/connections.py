@@ -22,13 +22,15 @@ __all__ = ["Connection", "Connections"]
 class Connection:
     """One engine's link to the server; it alone may name its bots, which are bots of `serving`.
 
-    `costs` are as it declared, then as it measures.
+    `costs` are as it declared, then as it measures. `is_pinned` where the engine named the very version: no other will
+    do.
     """
 
     id: str
     serving: Serving
     costs: Costs
     last_seen_s: float
+    is_pinned: bool = False
     bots: set[int] = field(default_factory=set)
 
     def check_owns(self, handles: Sequence[int]) -> None:
@@ -53,11 +55,11 @@ class Connections:
     def __iter__(self) -> Iterator[Connection]:
         return iter(self._by_id.values())
 
-    def open(self, cost_model: CostModel, serving: Serving) -> Connection:
+    def open(self, cost_model: CostModel, serving: Serving, *, is_pinned: bool = False) -> Connection:
         """A new connection to bots of `serving`; raises TooManyConnections."""
         if len(self._by_id) >= self._max_connections:
             raise TooManyConnections(f"all {self._max_connections} connections are taken", retry_after_s=1.0)
-        connection = Connection(secrets.token_hex(16), serving, Costs(cost_model), self._clock())
+        connection = Connection(secrets.token_hex(16), serving, Costs(cost_model), self._clock(), is_pinned)
         self._by_id[connection.id] = connection
         return connection
 

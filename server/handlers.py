@@ -34,6 +34,7 @@ from protocol.messages import (
     Welcome,
 )
 from server.connections import Connection, Connections
+from server.serving import Serving
 from server.servings import Servings
 
 __all__ = ["Handlers"]
@@ -98,17 +99,19 @@ class Handlers:
             raise BadSchema("this socket has said hello already: it carries one connection")
         if hello.protocol != PROTOCOL_VERSION:
             raise BadSchema(f"protocol {hello.protocol} is not spoken here, expected {PROTOCOL_VERSION}")
-        serving = self.servings.default()
+        serving = self.servings.named(hello.bundle)
         cost_model = hello.cost_model or CostModel.declared(serving.table)
         check_costs(cost_model, serving.table)
         self.end_silent()
-        connection = self._connections.open(cost_model, serving)
+        is_pinned = hello.bundle is not None and "@" in hello.bundle
+        connection = self._connections.open(cost_model, serving, is_pinned=is_pinned)
         self.servings.hold(serving)
         return serving.welcome(connection.id, cost_model, connection.costs.quantile, form)
 
     def _start_bots(self, request: StartBots, connection: Connection) -> BotsStarted:
+        serving = self._serving_of_next_bots(connection)
         self.servings.check_room(request.count)
-        handles = connection.serving.bots.start(
+        handles = serving.bots.start(
             request.count,
             seeds=request.seeds,
             target_returns=request.target_returns,
@@ -116,8 +119,18 @@ class Handlers:
             target_costs_us=request.target_costs_us,
             cost_model=connection.costs.declared,
         ).tolist()
+        if serving is not connection.serving:
+            self.servings.hold(serving)
+            self.servings.release(connection.serving)
+            connection.serving = serving
         connection.bots.update(handles)
-        return BotsStarted(bots=handles)
+        return BotsStarted(bots=handles, bundle_version=serving.version, bundle_sha256=serving.sha256)
+
+    def _serving_of_next_bots(self, connection: Connection) -> Serving:
+        """A connection has bots of one version at a time, so that no message ever names bots of two."""
+        if connection.bots or connection.is_pinned:
+            return connection.serving
+        return self.servings.successor(connection.serving)
 
     def _request_queries(self, request: RequestQueries, connection: Connection, form: Format) -> Queries:
         connection.check_owns(request.bots)

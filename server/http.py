@@ -71,7 +71,7 @@ class HttpDoor:
         """What is served, without a connection; needs the token as `Authorization: Bearer` where there is one."""
         try:
             self._check_bearer(request)
-            serving = await self._worker.run(self._handlers.servings.default)
+            serving = await self._worker.run(partial(self._handlers.servings.named, None))
         except ProtocolError as error:
             return _refused(error, Format.JSON)
         return Response(summary(serving.manifest), media_type=Format.JSON.value)

@@ -5,6 +5,8 @@ This module knows nothing about other bundles, transports or who is connected.
 
 from __future__ import annotations
 
+from msgspec import structs
+
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
 from bot_runtime.manifest import Manifest
@@ -18,11 +20,13 @@ __all__ = ["Serving"]
 class Serving:
     """A verified bundle with room for `max_bots` bots. `n_connections` hold it: it lives until the last lets go.
 
-    `bots` belong to the worker; everything else never changes, but for `n_connections`, which is the worker's too.
+    `version` is its number in the store, None where there is none. `bots` and `n_connections` belong to the worker; the
+    rest never changes.
     """
 
-    def __init__(self, bundle: Bundle, *, max_bots: int) -> None:
+    def __init__(self, bundle: Bundle, *, max_bots: int, version: int | None = None) -> None:
         self.bots = Bots(bundle, max_bots=max_bots)
+        self.version = version
         self.n_connections = 0
         self.max_body_bytes = {form: body_limit(self.table, max_bots, form) for form in Format}
 
@@ -30,6 +34,11 @@ class Serving:
     def name(self) -> str:
         """The bundle's name."""
         return self.manifest.name
+
+    @property
+    def sha256(self) -> str:
+        """Which content this is: the hash of its manifest."""
+        return self.bots.bundle.sha256
 
     @property
     def manifest(self) -> Manifest:
@@ -56,4 +65,15 @@ class Serving:
             max_body_bytes=self.max_body_bytes[form],
             target_cost_us=None if manifest.target_cost is None else manifest.target_cost * cost_model.full_us,
             cost_quantile=cost_quantile,
+            bundle_version=self.version,
+            bundle_sha256=self.sha256,
         )
+
+    def keeps_promises_of(self, other: Serving) -> bool:
+        """Whether all that a connection to `other` was told holds for this one too, but for which content it is."""
+        costs = CostModel.declared(other.table)
+        said, told = (
+            structs.replace(serving.welcome("", costs, 0.0, Format.MSGPACK), bundle_version=None, bundle_sha256=None)
+            for serving in (self, other)
+        )
+        return said == told

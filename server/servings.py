@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from protocol.codec import Format
-from protocol.errors import TooManyBots
+from protocol.errors import NoBundle, TooManyBots
 from server.serving import Serving
 
 __all__ = ["Servings"]
@@ -36,10 +36,23 @@ class Servings:
         """How many bots there are, of all bundles."""
         return sum(serving.bots.n_bots for serving in self._loaded)
 
-    def default(self) -> Serving:
-        """What a hello that names no bundle gets."""
-        (only,) = self._active.values()
-        return only
+    def named(self, bundle: str | None) -> Serving:
+        """The active one of this name, or NAME@VERSION in memory; None is the only name there is. Raises NoBundle."""
+        if bundle is None:
+            if len(self._active) != 1:
+                raise NoBundle(f"{len(self._active)} bundles are served: name one of {', '.join(sorted(self._active))}")
+            return next(iter(self._active.values()))
+        if bundle in self._active:
+            return self._active[bundle]
+        for serving in self._loaded:
+            if f"{serving.name}@{serving.version}" == bundle:
+                return serving
+        raise NoBundle(f"no bundle {bundle!r} is served")
+
+    def successor(self, serving: Serving) -> Serving:
+        """The active one of the same name if it keeps what was promised of `serving`, else `serving` itself."""
+        active = self._active[serving.name]
+        return active if active is not serving and active.keeps_promises_of(serving) else serving
 
     def activate(self, serving: Serving) -> None:
         """From now on new connections get this one where they would have got the one of the same name."""

@@ -39,6 +39,7 @@ _SUBMIT = {"type": "submit_features", "frame": 7, "bots": _BOTS, "acquired": _QU
 REQUESTS: dict[str, dict[str, Any]] = {
     "hello": {"type": "hello", "protocol": 1},
     "hello_cost_model_token": {"type": "hello", "protocol": 1, "cost_model": _COST_MODEL, "token": "s3cret é"},
+    "hello_bundle": {"type": "hello", "protocol": 1, "bundle": "golden@3"},
     "start_bots": {"type": "start_bots", "count": 2},
     "start_bots_all": {
         "type": "start_bots",
@@ -70,6 +71,8 @@ REQUESTS: dict[str, dict[str, Any]] = {
     "stop_bots": {"type": "stop_bots", "bots": _BOTS},
     "goodbye": {"type": "goodbye"},
 }
+_SERVED = {"bundle_version": 3, "bundle_sha256": "0123456789abcdef" * 4}
+_NO_VERSION = {"bundle_version": None, "bundle_sha256": None}
 _WELCOME = {
     "type": "welcome",
     "connection": "00112233445566778899aabbccddeeff",
@@ -83,11 +86,18 @@ _WELCOME = {
     "max_body_bytes": 65536,
     "target_cost_us": None,
     "cost_quantile": 0.998,
+    **_SERVED,
 }
 REPLIES: dict[str, dict[str, Any]] = {
     "welcome": _WELCOME,
-    "welcome_no_context_target_cost": {**_WELCOME, "context_length": 1, "target_cost_us": 6.8, "cost_quantile": None},
-    "bots_started": {"type": "bots_started", "bots": _BOTS},
+    "welcome_no_context_target_cost": {
+        **_WELCOME,
+        "context_length": 1,
+        "target_cost_us": 6.8,
+        "cost_quantile": None,
+        **_NO_VERSION,
+    },
+    "bots_started": {"type": "bots_started", "bots": _BOTS, **_SERVED},
     "queries": {"type": "queries", "frame": 7, "queries": _QUERIES, "cost_us": [23.5, 17.5], "infer_us": 80.25},
     "actions": {
         "type": "actions",
@@ -124,6 +134,7 @@ def _refused() -> dict[str, tuple[str, bytes]]:
         "not_utf8": ("BAD_MSGPACK", b"\x81\xa4type\xa2\xff\xff"),
         "array_bomb": ("BAD_MSGPACK", b"\xdd\xff\xff\xff\xff"),
         "too_deep": ("TOO_DEEP", b"\x91" * 16384 + b"\xc0"),
+        "bundle_name": ("BAD_SCHEMA", _pack({"type": "hello", "bundle": "../golden"})),
         "no_type": ("BAD_SCHEMA", _pack({"count": 1})),
         "unknown_type": ("BAD_SCHEMA", _pack({"type": "start_bot"})),
         "unknown_field": ("BAD_SCHEMA", _pack({"type": "start_bots", "count": 1, "colour": 2})),

@@ -84,7 +84,7 @@ def test_only_onnx_is_loaded_never_another_format_that_nobody_checked(bundle: Bu
     options.add_session_config_entry("session.save_model_format", "ORT")
     onnxruntime.InferenceSession(bundle.acquisition, options)
     with pytest.raises(BadBundle, match="does not load"):
-        Policy(Bundle(bundle.manifest, (tmp_path / "model.ort").read_bytes(), bundle.action))
+        Policy(Bundle(bundle.manifest, (tmp_path / "model.ort").read_bytes(), bundle.action, "0" * 64))
 
 
 def answer_the_first_bot_only(model: onnx.ModelProto) -> None:

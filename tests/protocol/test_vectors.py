@@ -16,7 +16,7 @@ from protocol.client import BotClient
 from protocol.codec import Format
 from protocol.errors import ProtocolError
 from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures, Welcome
-from protocol.replies import read_actions, read_queries, read_reply, read_welcome
+from protocol.replies import read_actions, read_bots_started, read_queries, read_reply, read_welcome
 from protocol.vectors.__main__ import write_vectors
 from tests.protocol.golden import BOTS, FOLDER, REFUSED, REPLIES, REQUESTS, TABLE, VECTORS, WELCOME, Vector
 
@@ -141,6 +141,7 @@ def _submission(vector: Vector) -> dict[str, Any]:
 def test_the_client_writes_requests_byte_for_byte() -> None:
     client, recorder = _client()
     client.hello(cost_model=WELCOME.cost_model, token="s3cret é")
+    client.hello(bundle="golden@3")
     client.start(2)
     client.start(2, seeds=[1, 2**63 - 1], target_returns=[100, 50.5], budgets_us=[20, 0], target_costs_us=[4.5, 0])
     client.act(**_submission(VECTORS["submit_features"]))
@@ -148,7 +149,7 @@ def test_the_client_writes_requests_byte_for_byte() -> None:
     client.act(**_submission(VECTORS["submit_features_measured"]))
     client.stop(BOTS)
     client.close()
-    names = ["hello", "hello_cost_model_token", "start_bots", "start_bots_all"]
+    names = ["hello", "hello_cost_model_token", "hello_bundle", "start_bots", "start_bots_all"]
     names += ["submit_features", "submit_features_failed", "submit_features_measured", "stop_bots", "goodbye"]
     assert recorder.sent == [VECTORS[name].body for name in names]
 
@@ -167,7 +168,10 @@ def test_the_client_reads_replies_field_for_field() -> None:
         welcome = read_welcome(read_reply(VECTORS[name].body, "hello"))
         said = msgspec.convert(VECTORS[name].message, Welcome)
         assert welcome._asdict() == {name: getattr(said, name) for name in welcome._fields}
-    assert read_reply(VECTORS["bots_started"].body, "start_bots")["bots"] == BOTS
+    handles, started = read_bots_started(read_reply(VECTORS["bots_started"].body, "start_bots"), welcome)
+    assert handles.tolist() == BOTS
+    assert (welcome.bundle_version, started.bundle_version) == (None, 3)
+    assert started == welcome._replace(bundle_version=3, bundle_sha256=WELCOME.bundle_sha256)
     said = VECTORS["queries"].message
     queries = read_queries(read_reply(VECTORS["queries"].body, "request_queries"), 2, TABLE)
     assert queries.queries.astype(int).tolist() == said["queries"]

@@ -42,4 +42,4 @@ def client(request: pytest.FixtureRequest, served: Served) -> Iterator[BotClient
 
 @pytest.fixture
 def welcome(client: BotClient) -> Welcome:
-    return client._connected()
+    return client.welcome

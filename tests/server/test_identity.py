@@ -90,7 +90,7 @@ def test_the_end_of_a_connection_frees_its_bots(served: Served, door: str) -> No
             client.start(client.hello().max_bots)
     with BotClient(address) as client:
         client.hello()
-        connection = client._connected().connection
+        connection = client.welcome.connection
         client.exchange({"type": "goodbye"})
         if door == "http":
             headers = {"Content-Type": "application/msgpack", "X-Bot-Connection": connection}

@@ -213,7 +213,7 @@ def test_other_paths_and_methods_get_error_messages_too(
 
 
 def test_too_many_bots_say_when_to_try_again_and_start_none(client: BotClient) -> None:
-    room = client._connected().max_bots
+    room = client.welcome.max_bots
     with pytest.raises(TooManyBots) as refusal:
         client.start(room + 1)
     assert refusal.value.retry_after_s

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from bot_runtime.bundle import Bundle
 from protocol.codec import Format
-from protocol.errors import TooManyBots
+from protocol.errors import NoBundle, TooManyBots
 from protocol.messages import Goodbye, Hello, RequestQueries, StartBots, StopBots
 from server.connections import Connections
 from server.handlers import Handlers
@@ -35,12 +37,12 @@ def _served(*bundles: Bundle, max_bots: int = 8, clock: FakeClock | None = None)
 
 def test_a_new_connection_gets_the_active_one_and_an_old_one_keeps_its_own(versions: list[Bundle]) -> None:
     handlers, servings = _served(versions[0])
-    old = servings.default()
+    old = servings.named(None)
     first = handlers.handle(Hello(), None, FORM).connection
     bots = handlers.handle(StartBots(2, seeds=[1, 2]), first, FORM).bots
     new = Serving(versions[1], max_bots=8)
     servings.activate(new)
-    assert servings.default() is new
+    assert servings.named(None) is new
     assert set(servings) == {old, new}
     second = handlers.handle(Hello(), None, FORM).connection
     handlers.handle(StartBots(1), second, FORM)
@@ -88,7 +90,64 @@ def test_max_bots_counts_the_bots_of_all_of_them(versions: list[Bundle]) -> None
 
 def test_the_longest_message_is_that_of_whatever_is_in_memory(versions: list[Bundle], serving: Serving) -> None:
     handlers, servings = _served(versions[0], max_bots=8)
-    small, large = serving.max_body_bytes, servings.default().max_body_bytes
+    small, large = serving.max_body_bytes, servings.named(None).max_body_bytes
     assert all(small[form] < large[form] == handlers.max_body_bytes[form] for form in Format)
     servings.activate(serving)
     assert handlers.max_body_bytes == small
+
+
+def test_a_connection_without_bots_starts_the_next_ones_on_the_active_version(versions: list[Bundle]) -> None:
+    servings = Servings(8)
+    servings.activate(Serving(versions[0], max_bots=8, version=1))
+    handlers = Handlers(servings, Connections(4, 60.0, FakeClock()), None)
+    hello = handlers.handle(Hello(bundle="tiny"), None, FORM)
+    pinned = handlers.handle(Hello(bundle="tiny@1"), None, FORM).connection
+    assert (hello.bundle_version, hello.bundle_sha256) == (1, versions[0].sha256)
+    bots = handlers.handle(StartBots(2), hello.connection, FORM).bots
+    servings.activate(Serving(versions[1], max_bots=8, version=2))
+    beside = handlers.handle(StartBots(1), hello.connection, FORM)
+    assert beside.bundle_version == 1
+    handlers.handle(StopBots([*bots, *beside.bots]), hello.connection, FORM)
+    with pytest.raises(TooManyBots):
+        handlers.handle(StartBots(9), hello.connection, FORM)
+    started = handlers.handle(StartBots(2), hello.connection, FORM)
+    assert (started.bundle_version, started.bundle_sha256) == (2, versions[1].sha256)
+    assert handlers.handle(StartBots(1), pinned, FORM).bundle_version == 1
+    handlers.end(pinned)
+    assert [serving.version for serving in servings] == [2]
+
+
+def test_a_version_that_breaks_what_welcome_said_is_for_new_connections_only(tmp_path: Path) -> None:
+    """The same features and action, but another default budget."""
+    servings = Servings(8)
+    for version, budget in ((1, 0.5), (2, 0.25)):
+        made = Bundle.load(make_bundle(tmp_path / str(version), budget=budget))
+        if version == 2:
+            handlers = Handlers(servings, Connections(4, 60.0, FakeClock()), None)
+            old = handlers.handle(Hello(), None, FORM)
+        servings.activate(Serving(made, max_bots=8, version=version))
+    assert handlers.handle(StartBots(1), old.connection, FORM).bundle_version == 1
+    assert handlers.handle(Hello(), None, FORM).bundle_version == 2
+
+
+def test_bundles_are_found_by_name_and_by_version_in_memory(versions: list[Bundle], tmp_path: Path) -> None:
+    servings = Servings(8)
+    one, two = (Serving(bundle, max_bots=8, version=n) for n, bundle in enumerate(versions[:2], 1))
+    other = Serving(Bundle.load(make_bundle(tmp_path, name="other")), max_bots=8)
+    with pytest.raises(NoBundle):
+        servings.named(None)
+    servings.activate(one)
+    assert servings.named(None) is servings.named("tiny") is servings.named("tiny@1") is one
+    servings.hold(one)
+    servings.activate(two)
+    servings.activate(other)
+    assert (servings.named("tiny"), servings.named("tiny@1"), servings.named("tiny@2")) == (two, one, two)
+    assert servings.named("other") is other
+    with pytest.raises(NoBundle, match="name one of other, tiny"):
+        servings.named(None)
+    for wrong in ("tiny@3", "tiny@01", "tiny@1\n", "tiny@", "", "other@1", "TINY"):
+        with pytest.raises(NoBundle):
+            servings.named(wrong)
+    servings.release(one)
+    with pytest.raises(NoBundle):
+        servings.named("tiny@1")

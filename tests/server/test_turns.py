@@ -52,7 +52,7 @@ def test_turns_over_any_door_are_the_bots_own(client: BotClient, bundle: Path) -
 
 
 def test_hello_says_what_is_served_and_the_engines_cost_model_counts(client: BotClient) -> None:
-    welcome = client._connected()
+    welcome = client.welcome
     assert welcome.features == TABLE
     assert (welcome.bundle, welcome.context_length) == ("tiny", 4)
     assert welcome.cost_model == CostModel.declared(TABLE)
