@@ -83,7 +83,7 @@ def _read_manifest(content: bytes) -> Manifest:
             expected = f"expected {SCHEMA_VERSION}: export the run again"
             raise BadBundle(f"{MANIFEST_FILE} has schema_version {version}, {expected}")
         return msgspec.json.decode(content, type=Manifest)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadBundle(f"{MANIFEST_FILE}: {error}") from error
 
 

@@ -22,6 +22,7 @@ MAX_FEATURES = 1024
 MAX_FEATURE_SIZE = 4096
 _NAME = re.compile(r"^[a-z][a-z0-9_]{0,63}$")
 _UNBOUNDED = 1e6
+_MAX_NUMBER = float(np.finfo(np.float32).max)  # a limit beyond would be infinite, and no limit, as float32
 
 
 class Feature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,8 +41,9 @@ class Feature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"feature {self.name} has size {self.size}, expected 1 to {MAX_FEATURE_SIZE}")
         if not 0.0 <= self.cost_us <= _UNBOUNDED:
             raise ValueError(f"feature {self.name} has cost_us {self.cost_us}, expected 0 to {_UNBOUNDED:g}")
-        if not -np.inf < self.low < self.high < np.inf:
-            raise ValueError(f"feature {self.name} has range [{self.low}, {self.high}], expected finite and increasing")
+        if not -_MAX_NUMBER <= self.low < self.high <= _MAX_NUMBER:
+            expected = "expected finite as float32 and increasing"
+            raise ValueError(f"feature {self.name} has range [{self.low}, {self.high}], {expected}")
 
 
 class FeatureTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
@@ -149,10 +151,9 @@ class ActionComponent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not _NAME.match(self.name):
             raise ValueError(f"action component name {self.name!r} does not match {_NAME.pattern}")
-        if not -np.inf < self.low < self.high < np.inf:
-            raise ValueError(
-                f"action component {self.name} has range [{self.low}, {self.high}], expected finite and increasing"
-            )
+        if not -_MAX_NUMBER <= self.low < self.high <= _MAX_NUMBER:
+            expected = "expected finite as float32 and increasing"
+            raise ValueError(f"action component {self.name} has range [{self.low}, {self.high}], {expected}")
         if not self.low <= self.safe <= self.high:
             raise ValueError(
                 f"action component {self.name} has safe value {self.safe} outside [{self.low}, {self.high}]"

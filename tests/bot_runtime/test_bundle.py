@@ -106,6 +106,8 @@ def test_missing_linked_or_not_a_file(copy: Path, file: str) -> None:
         {"surprise": 1},
         {"features": {"features": []}},
         {"action": {"components": []}},
+        {"features": {"features": [{"name": "a", "size": 1, "high": 1e39}]}},  # infinite as float32: no limit at all
+        {"action": {"components": [{"name": "a", "low": -1e39, "high": 1.0}]}},
     ],
     ids=lambda fields: "-".join(fields),
 )
@@ -122,7 +124,7 @@ def test_a_bundle_of_an_earlier_schema_says_what_to_do(copy: Path) -> None:
         Bundle.load(copy)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[" * 10**6, b"\xff\xfe", b" " * (2**20 + 1)])
+@pytest.mark.parametrize("content", [b"", b"{", b"[" * 10**6, b"\xff\xfe", b'{"\xcf": 1}', b" " * (2**20 + 1)])
 def test_manifest_that_is_not_json(copy: Path, content: bytes) -> None:
     (copy / "manifest.json").write_bytes(content)
     with pytest.raises(BadBundle, match=r"manifest\.json"):
