@@ -21,6 +21,8 @@ from protocol.replies import read_queries
 from server.answer import Answer, Arrival, answer
 from server.connections import Connections
 from server.handlers import Handlers
+from server.serving import Serving
+from server.servings import Servings
 from tests.server.serving import costly_numbers, free_numbers
 
 __all__ = ["PENDING_FRAME", "UNDOCUMENTED", "Desk", "Exchange", "Twins"]
@@ -46,10 +48,12 @@ class Desk:
     """Handlers with one connection and two bots, which have played a frame and wait for the features of another."""
 
     def __init__(self, bundle: Bundle) -> None:
-        self.bots = Bots(bundle, max_bots=MAX_BOTS, clock=lambda: 0, first_generation=1)
+        serving, servings = Serving(bundle, max_bots=MAX_BOTS), Servings(max_bots=MAX_BOTS)
+        serving.bots = self.bots = Bots(bundle, max_bots=MAX_BOTS, clock=lambda: 0, first_generation=1)
+        servings.activate(serving)
         self.table = bundle.manifest.features
         # More than are ever open at once: those that are refused close nothing.
-        self._handlers = Handlers(self.bots, Connections(4, 1e9), None)
+        self._handlers = Handlers(servings, Connections(4, 1e9), None)
         self._connection: str | None = None
         self.handles: list[int] = []
 
