@@ -42,7 +42,7 @@ class Answer(NamedTuple):
 
 def answer(
     handlers: Handlers,
-    body: bytes,
+    sent: bytes | Request,
     form: Format,
     connection_id: str | None,
     arrival: Arrival,
@@ -50,13 +50,16 @@ def answer(
     kind: type[Request] | None = None,
     reply_form: Format | None = None,
 ) -> Answer:
-    """Decode, handle, encode. `arrival` is how and when the request came.
+    """Decode, handle, encode. `sent` is the body, or the request where it is decoded already; `arrival` is how it came.
 
     `kind` is the message type where the door fixes it; `reply_form` is else `form`.
     """
     reply_form = reply_form or form
     try:
-        request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)
+        if not isinstance(sent, bytes):
+            request: Request = sent
+        else:
+            request = codec.decode_request(sent, form) if kind is None else codec.decode(sent, form, kind)
         reply = handlers.handle(request, connection_id, reply_form)
         return Answer(reply, codec.encode(reply, reply_form), 200)
     except ProtocolError as error:

@@ -10,17 +10,20 @@ import socket
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
+from functools import partial
 
 import uvicorn
 
 from bot_runtime.bundle import Bundle
 from server.connections import Connections
+from server.desk import Desk
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
 from server.serving import Serving
 from server.servings import Servings
 from server.settings import Settings
-from server.stream import StreamDoor
+from server.sockets import Sockets
+from server.stream import StreamSocket
 from server.worker import Worker
 
 __all__ = ["running"]
@@ -41,16 +44,16 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
     async with AsyncExitStack() as stack:
         worker = Worker(settings.max_queue)
         stack.callback(worker.close)
-        http = HttpDoor(handlers, worker, body_deadline_s=settings.frame_deadline_s)
+        desk = Desk(handlers, worker, inline_us=settings.inline_us)
+        http = HttpDoor(desk, worker, body_deadline_s=settings.frame_deadline_s)
         uvicorn_server, http_address = await stack.enter_async_context(_http(settings, http))
-        stream = StreamDoor(
-            handlers,
-            worker,
+        sockets = Sockets(
+            desk,
             max_sockets=settings.max_connections,
             frame_deadline_s=settings.frame_deadline_s,
             idle_ttl_s=settings.idle_ttl_s,
         )
-        addresses = {"http": http_address, **await stack.enter_async_context(_streams(settings, stream))}
+        addresses = {"http": http_address, **await stack.enter_async_context(_streams(settings, sockets))}
         await stack.enter_async_context(_sweeping(handlers, worker, settings.idle_ttl_s / 4))
         try:
             yield addresses
@@ -98,22 +101,26 @@ async def _http(settings: Settings, door: HttpDoor) -> AsyncIterator[tuple[uvico
 
 
 @asynccontextmanager
-async def _streams(settings: Settings, door: StreamDoor) -> AsyncIterator[dict[str, str]]:
+async def _streams(settings: Settings, sockets: Sockets) -> AsyncIterator[dict[str, str]]:
     addresses: dict[str, str] = {}
     servers: list[asyncio.Server] = []
+    loop = asyncio.get_running_loop()
     try:
         if settings.tcp_port is not None:
             listening = _listen(settings.host, settings.tcp_port)
-            servers.append(await asyncio.start_server(door.serve, sock=listening, backlog=_BACKLOG))
+            tcp = partial(StreamSocket, sockets, "tcp")
+            servers.append(await loop.create_server(tcp, sock=listening, backlog=_BACKLOG))
             addresses["tcp"] = f"tcp://{_host(settings.host)}:{listening.getsockname()[1]}"
         if settings.uds is not None:
-            servers.append(await asyncio.start_unix_server(door.serve, path=settings.uds, backlog=_BACKLOG))
+            unix = partial(StreamSocket, sockets, "unix")
+            path = str(settings.uds)  # uvloop takes no Path here
+            servers.append(await loop.create_unix_server(unix, path, backlog=_BACKLOG))
             addresses["unix"] = f"unix://{settings.uds.absolute()}"
         yield addresses
     finally:
         for server in servers:
             server.close()
-        await door.drain(settings.drain_s)
+        await sockets.drain(settings.drain_s)
         for server in servers:
             await server.wait_closed()
         if settings.uds is not None and "unix" in addresses:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Awaitable, Callable
-from functools import partial
 
 import msgspec
 from fastapi import FastAPI
@@ -31,8 +30,8 @@ from protocol.errors import (
     TooLarge,
     UnsupportedMediaType,
 )
-from server.answer import Answer, Arrival, answer, refusal
-from server.handlers import Handlers
+from server.answer import Answer, Arrival, refusal
+from server.desk import Desk
 from server.openapi import CONNECTION_HEADER, ROUTES, document, summary
 from server.worker import Worker
 
@@ -45,8 +44,9 @@ _BY_STATUS: dict[int, type[ProtocolError]] = {404: NoRoute, 405: MethodNotAllowe
 class HttpDoor:
     """Answers HTTP requests; `ready` is what /readyz says."""
 
-    def __init__(self, handlers: Handlers, worker: Worker, *, body_deadline_s: float) -> None:
-        self._handlers = handlers
+    def __init__(self, desk: Desk, worker: Worker, *, body_deadline_s: float) -> None:
+        self._desk = desk
+        self._handlers = desk.handlers
         self._worker = worker
         self._body_deadline_s = body_deadline_s
         self.ready = True
@@ -60,8 +60,8 @@ class HttpDoor:
             body = await self._body(request, form)
             connection = None if kind is messages.Hello else request.headers.get(CONNECTION_HEADER)
             arrival = Arrival.now("http")
-            job = partial(answer, self._handlers, body, form, connection, arrival, kind=kind, reply_form=reply_form)
-            return _response(await self._worker.run(job), reply_form)
+            answered = self._desk.ask(body, form, connection, arrival, kind=kind, reply_form=reply_form)
+            return _response(answered if isinstance(answered, Answer) else await answered, reply_form)
         except ProtocolError as error:
             return _refused(error, reply_form or Format.JSON)
         except ClientDisconnect:

@@ -32,6 +32,9 @@ class Settings:
     """Connections at any time, and open stream sockets."""
     max_queue: int = 64
     """Requests that wait for the inference thread; those beyond are refused with NOT_READY."""
+    inline_us: float = 1000.0
+    """A turn that is known to take no longer than this is answered on the event loop itself, which saves the hop to the
+    inference thread and is how long one engine may hold up the others. 0 hands every turn to the thread."""
     idle_ttl_s: float = 60.0
     """A connection that is silent for this long ends, and its bots with it."""
     frame_deadline_s: float = 3.0
@@ -50,6 +53,8 @@ class Settings:
             raise ValueError("max_bots, max_connections and max_queue must be at least 1")
         if min(self.idle_ttl_s, self.frame_deadline_s, self.drain_s) <= 0:
             raise ValueError("idle_ttl_s, frame_deadline_s and drain_s must be positive")
+        if not self.inline_us >= 0:
+            raise ValueError("inline_us must not be negative")
         if self.token == "":
             raise ValueError("the token must not be empty")
         if self.token is None and not self.insecure_no_token and not _is_loopback(self.host):

@@ -1,7 +1,7 @@
-"""One thread that does all the work, so that the event loop never waits for a model.
+"""One thread for the work that the event loop must not wait for.
 
-This module knows nothing about what the work is. Everything that touches bots runs here, one job at a time, so nothing
-there needs a lock.
+This module knows nothing about what the work is. Whatever touches bots runs here, one job at a time, or on the event
+loop while `is_idle`: never both, so nothing there needs a lock.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, TypeVar
 
 from protocol.errors import NotReady
 
@@ -22,65 +22,72 @@ _log = logging.getLogger(__name__)
 
 
 class Worker:
-    """A thread and its bounded queue. `run` and `post` are for the event loop's thread only."""
+    """A thread and its bounded queue. Everything but the thread itself is for the event loop's thread only."""
 
     def __init__(self, max_queue: int) -> None:
         self._max_queue = max_queue
-        self._waiting = 0
-        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._taken = 0  # jobs that were put into the queue: the event loop alone counts them
+        self._done = 0  # jobs that have ended: the thread alone counts them
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="inference", daemon=True)
         self._thread.start()
 
-    async def run(self, job: Callable[[], T]) -> T:
-        """The job's result, or what it raised. Raises NotReady at once when too many jobs wait already."""
-        if self._waiting >= self._max_queue:
-            raise NotReady(f"{self._waiting} requests are waiting already", retry_after_s=0.1)
-        loop = asyncio.get_running_loop()
-        outcome: asyncio.Future[T] = loop.create_future()
-        self._waiting += 1
-        try:
-            self._jobs.put(_Call(job, loop, outcome))
-            return await outcome
-        finally:
-            self._waiting -= 1
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing runs or waits here: until the next `run` or `post` the event loop has the bots to itself."""
+        return self._taken == self._done
 
-    def post(self, job: Callable[[], None]) -> None:
+    def run(self, job: Callable[[], T]) -> asyncio.Future[T]:
+        """The job's result to be, or what it raises. Raises NotReady at once when too many jobs wait already."""
+        waiting = self._taken - self._done
+        if waiting >= self._max_queue:
+            raise NotReady(f"{waiting} requests are waiting already", retry_after_s=0.1)
+        outcome: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+        self._put(_Job(job, outcome))
+        return outcome
+
+    def post(self, job: Callable[[], object]) -> None:
         """Do this too, in its turn, without anybody waiting for it: never refused, so for ending things only."""
-        self._jobs.put(job)
+        self._put(_Job(job, None))
 
     def close(self) -> None:
         """Finish what was queued and end the thread."""
         self._jobs.put(None)
         self._thread.join()
 
+    def _put(self, job: _Job) -> None:
+        self._taken += 1
+        self._jobs.put(job)
+
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
             try:
-                job()
-            except Exception:
-                _log.exception("a job failed")
+                result, error = job.call(), None
+            except Exception as raised:
+                result, error = None, raised
+            self._done += 1  # before anyone is told: whoever is may put the next job at once
+            job.tell(result, error)
 
 
-class _Call(Generic[T]):
-    """A job whose outcome goes back to the event loop that waits for it."""
+class _Job:
+    """A call, and the future of whoever waits for its outcome, if anybody does."""
 
-    def __init__(self, job: Callable[[], T], loop: asyncio.AbstractEventLoop, outcome: asyncio.Future[T]) -> None:
-        self._job = job
-        self._loop = loop
-        self.outcome = outcome
+    def __init__(self, call: Callable[[], object], outcome: asyncio.Future[Any] | None) -> None:
+        self.call = call
+        self._outcome = outcome
 
-    def __call__(self) -> None:
-        try:
-            result = self._job()
-        except Exception as error:
-            self._loop.call_soon_threadsafe(self._fail, error)
+    def tell(self, result: object, error: Exception | None) -> None:
+        """Hand the outcome to the event loop; what nobody waits for is logged where it failed."""
+        if self._outcome is not None:
+            self._outcome.get_loop().call_soon_threadsafe(self._settle, self._outcome, result, error)
+        elif error is not None:
+            _log.error("a job failed", exc_info=error)
+
+    @staticmethod
+    def _settle(outcome: asyncio.Future[Any], result: object, error: Exception | None) -> None:
+        if outcome.done():
+            return  # nobody waits any more: the client went away
+        if error is None:
+            outcome.set_result(result)
         else:
-            self._loop.call_soon_threadsafe(self._succeed, result)
-
-    def _succeed(self, result: T) -> None:
-        if not self.outcome.done():  # nobody waits any more if the client went away
-            self.outcome.set_result(result)
-
-    def _fail(self, error: Exception) -> None:
-        if not self.outcome.done():
-            self.outcome.set_exception(error)
+            outcome.set_exception(error)

@@ -13,7 +13,7 @@ import pytest
 from protocol.client import BotClient
 from protocol.codec import MAX_DETAIL_CHARS, Format
 from protocol.errors import TooManyBots
-from server import http, stream
+from server import desk
 from server.answer import Answer, Arrival, answer, refusal
 from tests.server.serving import Served
 
@@ -50,8 +50,7 @@ def test_every_request_says_by_which_door_and_when_it_came(
         arrivals.append(arrival)
         return answer(handlers, body, form, connection, arrival, **how)
 
-    for module in (http, stream):
-        monkeypatch.setattr(module, "answer", noted)
+    monkeypatch.setattr(desk, "answer", noted)
     begun_ns = time.monotonic_ns()
     with BotClient(served.addresses[door]) as client:
         client.hello()

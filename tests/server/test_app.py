@@ -14,12 +14,13 @@ from protocol.errors import BadBundle
 from server import app
 from server.app import _listen, running
 from server.connections import Connections
+from server.desk import Desk
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
 from server.serving import Serving
 from server.servings import Servings
 from server.settings import Settings
-from server.stream import StreamDoor
+from server.sockets import Sockets
 from server.worker import Worker
 
 
@@ -51,7 +52,8 @@ def test_a_draining_door_is_alive_and_not_ready(bundle: Path) -> None:
     worker = Worker(1)
     servings = Servings(max_bots=1)
     servings.activate(Serving(Bundle.load(bundle), max_bots=1))
-    door = HttpDoor(Handlers(servings, Connections(1, 1.0), None), worker, body_deadline_s=1.0)
+    handlers = Handlers(servings, Connections(1, 1.0), None)
+    door = HttpDoor(Desk(handlers, worker, inline_us=0.0), worker, body_deadline_s=1.0)
     application = create_app(door)
 
     def get(path: str) -> tuple[int, dict[str, Any], dict[bytes, bytes]]:
@@ -89,7 +91,7 @@ def test_a_server_that_ends_is_not_ready_before_it_drains(bundle: Path, monkeypa
         ready_when_draining.append(doors[0].ready)
 
     monkeypatch.setattr(app, "create_app", remember)
-    monkeypatch.setattr(StreamDoor, "drain", drain)
+    monkeypatch.setattr(Sockets, "drain", drain)
 
     async def main() -> None:
         async with running(Settings(bundle=bundle, port=0)):

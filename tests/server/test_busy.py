@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from server import stream
+from server import desk
 from server.answer import Answer, answer
-from server.stream import StreamDoor
+from server.sockets import Sockets
 from tests.protocol.golden import VECTORS
 from tests.server.serving import RawStream, http_request, serve
 
@@ -17,16 +17,16 @@ HELLO = VECTORS["hello"]
 
 
 class Gate:
-    """Holds up every stream request on the worker's thread until it is opened."""
+    """Holds up every request, hellos on the worker's thread, until it is opened."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.reached, self.opened = threading.Event(), threading.Event()
-        monkeypatch.setattr(stream, "answer", self._answer)
+        monkeypatch.setattr(desk, "answer", self._answer)
 
-    def _answer(self, *arguments: object) -> Answer:
+    def _answer(self, *arguments: object, **how: object) -> Answer:
         self.reached.set()
         self.opened.wait()
-        return answer(*arguments)
+        return answer(*arguments, **how)
 
 
 def test_a_full_queue_refuses_at_once_at_every_door(
@@ -55,13 +55,13 @@ def test_a_full_queue_refuses_at_once_at_every_door(
 def test_stopping_answers_the_request_in_progress(
     bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gate, drain, draining = Gate(monkeypatch), StreamDoor.drain, threading.Event()
+    gate, drain, draining = Gate(monkeypatch), Sockets.drain, threading.Event()
 
-    async def announced(self: StreamDoor, timeout_s: float) -> None:
+    async def announced(self: Sockets, timeout_s: float) -> None:
         draining.set()
         await drain(self, timeout_s)
 
-    monkeypatch.setattr(StreamDoor, "drain", announced)
+    monkeypatch.setattr(Sockets, "drain", announced)
     with serve(bundle, tmp_path / "s") as served, RawStream(served.addresses["tcp"]) as raw:
         raw.socket.sendall(HELLO.frame)
         gate.reached.wait()

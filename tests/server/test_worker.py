@@ -43,8 +43,8 @@ def test_the_loop_goes_on_and_a_full_queue_refuses_at_once() -> None:
     async def main() -> None:
         worker, release = Worker(max_queue=2), threading.Event()
         try:
-            slow = asyncio.create_task(worker.run(release.wait))
-            waiting = asyncio.create_task(worker.run(lambda: "done"))
+            slow = asyncio.ensure_future(worker.run(release.wait))
+            waiting = asyncio.ensure_future(worker.run(lambda: "done"))
             await asyncio.sleep(0)
             with pytest.raises(NotReady) as refusal:
                 await worker.run(lambda: "never")
@@ -63,7 +63,7 @@ def test_a_job_that_nobody_waits_for_any_more_harms_nothing() -> None:
     async def main() -> None:
         worker, release = Worker(max_queue=2), threading.Event()
         try:
-            left = asyncio.create_task(worker.run(release.wait))
+            left = asyncio.ensure_future(worker.run(release.wait))
             await asyncio.sleep(0)
             left.cancel()
             await asyncio.gather(left, return_exceptions=True)

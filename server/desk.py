@@ -1,0 +1,109 @@
+"""Where a request is answered: on the event loop if that is known to be quick, else by the worker.
+
+This module knows nothing about sockets, or about what an answer says. A hop to the worker's thread and back costs more
+than a turn of a few bots, so those stay here; what is large, rare or not yet known goes there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from functools import partial
+
+from protocol import codec
+from protocol.codec import Format
+from protocol.errors import NotReady, ProtocolError
+from protocol.messages import Request, RequestQueries, SubmitFeatures
+from server.answer import Answer, Arrival, answer, refusal
+from server.handlers import Handlers
+from server.worker import Worker
+
+__all__ = ["Desk", "Pace"]
+
+_MAX_INLINE_BYTES = 16384  # decoding so much takes less than a turn
+_Kind = tuple[type[Request], int]  # and the number of bits in its number of bots: sizes within a factor of two
+
+Answered = Answer | asyncio.Future[Answer]
+
+
+class Pace:
+    """How long requests take, by kind and size: about their 90 % quantile, by steps up and down, in µs.
+
+    One odd measurement doubles an estimate; it takes ten good ones to take that back.
+    """
+
+    def __init__(self) -> None:
+        self._us: dict[_Kind, float] = {}
+
+    def expected_us(self, kind: _Kind) -> float:
+        """What the next one is expected to take; infinite before the first."""
+        return self._us.get(kind, float("inf"))
+
+    def observe(self, kind: _Kind, took_us: float) -> None:
+        """One has taken so long."""
+        known_us = self._us.get(kind)
+        if known_us is None:
+            self._us[kind] = took_us
+        else:
+            self._us[kind] = known_us * (2.0 if took_us > known_us else 0.93)
+
+
+class Desk:
+    """Answers requests of every door in the order in which they come, one at a time.
+
+    A turn is answered before `ask` returns if the worker is idle and turns like it take at most `inline_us` of
+    processor time. That is how long one client's request may hold up the event loop: one that is larger, or of a size
+    that was not met before, never does. `clock` counts ns of the calling thread's processor time.
+    """
+
+    def __init__(
+        self, handlers: Handlers, worker: Worker, *, inline_us: float, clock: Callable[[], int] = time.thread_time_ns
+    ) -> None:
+        self.handlers = handlers
+        self._worker = worker
+        self._inline_us = inline_us
+        self._clock = clock
+        self._pace = Pace()
+
+    def ask(
+        self,
+        body: bytes,
+        form: Format,
+        connection_id: str | None,
+        arrival: Arrival,
+        *,
+        kind: type[Request] | None = None,
+        reply_form: Format | None = None,
+    ) -> Answered:
+        """The answer, or the future of it. Arguments are those of `server.answer.answer`."""
+        how = partial(answer, self.handlers, arrival=arrival, kind=kind, reply_form=reply_form)
+        if len(body) > _MAX_INLINE_BYTES:
+            return self._hop(partial(how, body, form, connection_id), reply_form or form)
+        try:
+            request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)
+        except ProtocolError:
+            return how(body, form, connection_id)  # which refuses it, bots untouched
+        if not isinstance(request, RequestQueries | SubmitFeatures):
+            return self._hop(partial(how, request, form, connection_id), reply_form or form)
+        turn = type(request), len(request.bots).bit_length()
+        job = partial(self._timed, turn, partial(how, request, form, connection_id))
+        if self._worker.is_idle and self._pace.expected_us(turn) <= self._inline_us:
+            return job()
+        return self._hop(job, reply_form or form)
+
+    def end(self, connection_id: str) -> None:
+        """End a connection whose socket has closed, after what was asked for on it."""
+        self._worker.post(partial(self.handlers.end, connection_id))
+
+    def _hop(self, job: Callable[[], Answer], form: Format) -> Answered:
+        try:
+            return self._worker.run(job)
+        except NotReady as error:
+            return refusal(error, form)
+
+    def _timed(self, turn: _Kind, job: Callable[[], Answer]) -> Answer:
+        begun_ns = self._clock()
+        answered = job()
+        self._pace.observe(turn, (self._clock() - begun_ns) / 1e3)
+        return answered

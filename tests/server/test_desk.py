@@ -1,0 +1,175 @@
+"""What is answered on the event loop and what is not, on real bots; processor time is a number that the tests set."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+
+from bot_runtime.bundle import Bundle
+from protocol.codec import Format
+from protocol.messages import RequestQueries, SubmitFeatures
+from server import desk as module
+from server.answer import Answer, Arrival, answer
+from server.connections import Connections
+from server.desk import Desk, Pace
+from server.handlers import Handlers
+from server.serving import Serving
+from server.servings import Servings
+from server.worker import Worker
+from tests.protocol.golden import TABLE
+from tests.server.serving import free_numbers
+
+BOUND_US = 500.0
+
+
+class Counter:
+    """A desk's requests one after the other, each said to take `us`, and where each was answered."""
+
+    def __init__(self, bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        servings = Servings(max_bots=8)
+        servings.activate(Serving(Bundle.load(bundle), max_bots=8))
+        self.worker = Worker(max_queue=4)
+        self.us, self._now_ns, self._frame = 10.0, 0, 0
+        self.threads: list[int] = []
+        monkeypatch.setattr(module, "answer", self._answer)
+        handlers = Handlers(servings, Connections(4, 60.0), None)
+        self.desk = Desk(handlers, self.worker, inline_us=BOUND_US, clock=lambda: self._now_ns)
+        self.connection: str | None = None
+
+    async def ask(self, message: dict[str, object]) -> tuple[dict[str, object], bool]:
+        """The reply, and whether it was given on the event loop."""
+        answered = self.put(message)
+        answered = answered if isinstance(answered, Answer) else await answered
+        return msgpack.unpackb(answered.body), self.threads[-1] == threading.get_ident()
+
+    def put(self, message: dict[str, object]) -> Answer | asyncio.Future[Answer]:
+        return self.desk.ask(msgpack.packb(message), Format.MSGPACK, self.connection, Arrival.now("tcp"))
+
+    async def start(self, count: int) -> list[int]:
+        welcome, _ = await self.ask({"type": "hello"})
+        self.connection = str(welcome["connection"])
+        started, _ = await self.ask({"type": "start_bots", "count": count})
+        return list(started["bots"])
+
+    async def query(self, bots: list[int]) -> bool:
+        """Whether the next frame's query of these bots was answered on the event loop."""
+        reply, inline = await self.ask(self.request(bots))
+        assert reply["type"] == "queries"
+        return inline
+
+    def request(self, bots: list[int]) -> dict[str, object]:
+        self._frame += 1
+        free = free_numbers(TABLE, len(bots), self._frame).tobytes()
+        return {"type": "request_queries", "frame": self._frame, "bots": bots, "free": free}
+
+    def _answer(self, *arguments: object, **how: object) -> Answer:
+        self.threads.append(threading.get_ident())
+        self._now_ns += int(self.us * 1e3)
+        return answer(*arguments, **how)
+
+
+@pytest.fixture
+def at_desk(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Counter], object]], None]:
+    def run(test: Callable[[Counter], object]) -> None:
+        async def main() -> None:
+            counter = Counter(bundle, monkeypatch)
+            try:
+                await test(counter)
+            finally:
+                counter.worker.close()
+
+        asyncio.run(main())
+
+    return run
+
+
+def test_a_turn_that_is_known_to_be_quick_stays_on_the_loop(at_desk: Callable[..., None]) -> None:
+    async def test(counter: Counter) -> None:
+        bots = await counter.start(8)
+        assert [await counter.query(bots[:1]) for _ in range(3)] == [False, True, True]
+        assert [await counter.query(bots) for _ in range(3)] == [False, True, True]  # another size, unknown at first
+        assert [await counter.query(bots[:5]) for _ in range(3)] == [False, True, True]
+
+    at_desk(test)
+
+
+def test_a_turn_that_becomes_slow_leaves_the_loop_and_comes_back(at_desk: Callable[..., None]) -> None:
+    async def test(counter: Counter) -> None:
+        bots = await counter.start(1)
+        counter.us = 300.0
+        assert [await counter.query(bots) for _ in range(2)] == [False, True]
+        counter.us = 5000.0
+        assert await counter.query(bots)  # nobody knew
+        assert not any([await counter.query(bots) for _ in range(20)])
+        counter.us = 300.0
+        where = [await counter.query(bots) for _ in range(100)]
+        assert not where[0]
+        assert where[-1]
+
+    at_desk(test)
+
+
+def test_one_odd_measurement_changes_nothing(at_desk: Callable[..., None]) -> None:
+    async def test(counter: Counter) -> None:
+        bots = await counter.start(1)
+        for counter.us in (100.0, 100.0, 50000.0, 100.0):
+            await counter.query(bots)
+        assert await counter.query(bots)
+
+    at_desk(test)
+
+
+def test_while_the_worker_is_busy_nothing_touches_the_bots_on_the_loop(at_desk: Callable[..., None]) -> None:
+    async def test(counter: Counter) -> None:
+        bots, release = await counter.start(1), threading.Event()
+        assert [await counter.query(bots) for _ in range(2)] == [False, True]
+        holding = counter.worker.run(release.wait)
+        first, second = (counter.put(counter.request(bots)) for _ in range(2))
+        release.set()
+        answers = [await first, await second]  # in their order: the second frame is the newer one
+        assert [msgpack.unpackb(each.body)["type"] for each in answers] == ["queries", "queries"]
+        assert threading.get_ident() not in counter.threads[-2:]
+        await holding
+        assert await counter.query(bots)
+
+    at_desk(test)
+
+
+def test_only_small_turns_and_refusals_are_answered_on_the_loop(at_desk: Callable[..., None]) -> None:
+    async def test(counter: Counter) -> None:
+        bots = await counter.start(1)
+        assert [await counter.query(bots) for _ in range(2)] == [False, True]
+        for message in ({"type": "start_bots", "count": 1}, {"type": "stop_bots", "bots": bots}, {"type": "goodbye"}):
+            assert (await counter.ask(message))[1] is False
+        assert await counter.ask({"type": "hello", "unknown": 1}) == (
+            {
+                "type": "error",
+                "code": "BAD_SCHEMA",
+                "detail": "Object contains unknown field `unknown`",
+                "retry_after_s": None,
+            },
+            True,
+        )
+        reply, inline = await counter.ask({"type": "hello", "token": "x" * 20000})
+        assert (reply["code"], inline) == ("BAD_SCHEMA", False)
+
+    at_desk(test)
+
+
+def test_an_estimate_follows_the_ninth_of_ten_measurements() -> None:
+    pace, rng = Pace(), np.random.default_rng(0)
+    kind = RequestQueries, 3
+    assert pace.expected_us(kind) == float("inf")
+    times_us = rng.uniform(0.0, 1000.0, 4000)
+    below = []
+    for took_us in times_us:
+        below.append(took_us <= pace.expected_us(kind))
+        pace.observe(kind, float(took_us))
+    assert 0.87 < np.mean(below[1000:]) < 0.94
+    assert pace.expected_us((SubmitFeatures, 3)) == float("inf")
