@@ -18,8 +18,8 @@ __all__ = ["changed_bytes", "changed_json", "changed_msgpack"]
 _VALUES: list[Any] = [
     None, True, False, 0, 1, 2, 7, 8, -1, 255, 65535, 65536, 2**31, 2**32, 2**53, 2**53 + 1, 2**63 - 1, 2**63,
     2**64 - 1, -(2**63), 0.0, -0.0, 0.5, 1e-320, 1e9, 1.1e9, 3.5e38, 1e308, math.nan, math.inf, -math.inf, "", "a",
-    "type", "query", "x" * 1025, "\ud7ff\x00", b"", b"\x00", b"\xff" * 8, b"\x00\x00\xc0\x7f", [], [[]], [0] * 3, [[0.5]], {},
-    {"type": "goodbye"}, msgpack.Timestamp(0, 0), msgpack.ExtType(5, b"abc"),
+    "type", "query", "x" * 1025, "\ud7ff\x00", b"", b"\x00", b"\xff" * 8, b"\x00\x00\xc0\x7f", [], [[]], [0] * 3,
+    [[0.5]], {}, {"type": "goodbye"}, msgpack.Timestamp(0, 0), msgpack.ExtType(5, b"abc"),
 ]  # fmt: skip
 _BYTES = bytes.fromhex("00 01 7f 80 90 a0 c0 c1 c4 c7 ca cb cf d9 dc dd de df ff")
 
