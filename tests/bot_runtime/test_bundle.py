@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bot_runtime import bundle as bundle_module
+from bot_runtime import contents as contents_module
 from bot_runtime.bundle import Bundle
 from bot_runtime.manifest import FILES
 from protocol.errors import BadBundle
@@ -164,7 +165,7 @@ def test_any_damaged_byte_is_refused_before_parsing(copy: Path, monkeypatch: pyt
 
 
 def test_larger_than_any_bundle(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bundle_module, "MAX_FILE_BYTES", 100)
+    monkeypatch.setattr(contents_module, "MAX_FILE_BYTES", 100)
     with pytest.raises(BadBundle, match="more than 100 bytes"):
         Bundle.load(copy)
 
