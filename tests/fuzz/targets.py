@@ -15,7 +15,8 @@ from typing import Any
 import msgpack
 import msgspec
 
-from bot_runtime.bundle import MANIFEST_FILE, Bundle
+from bot_runtime.bundle import Bundle
+from bot_runtime.contents import MANIFEST_FILE
 from protocol import codec
 from protocol.codec import Format
 from protocol.errors import BadBundle, ProtocolError
