@@ -25,8 +25,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.clocks import Clock
 from benchmarks.outputs import Case, Source, adversarial, all_ones, hostile, trained, uniform
-from benchmarks.rays import Clock, RayTally, cast_frames, play
+from benchmarks.rays import RayTally, cast_frames, play
 from bot_runtime.budget import allocate
 from bot_runtime.bundle import Bundle
 from bot_runtime.costs import Report, as_text

@@ -7,14 +7,13 @@ of another engine; the rays are cast, the frame is timed, and the costs learn fr
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
+from benchmarks.clocks import CLOCKS, Clock
 from bot_runtime.budget import allocate
 from bot_runtime.costs import Costs, Report
 from game.layout import draw_layout
@@ -22,10 +21,8 @@ from game.rays import RAYS, cost_model, load_costs
 from game.terrain import load_map
 from game.world import World
 
-__all__ = ["Clock", "RayTally", "cast_frames", "play"]
+__all__ = ["RayTally", "cast_frames", "play"]
 
-Clock = Literal["cpu", "wall"]
-CLOCKS: dict[Clock, Callable[[], int]] = {"cpu": time.thread_time_ns, "wall": time.perf_counter_ns}
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of what all rays of all bots would take by the shipped measurement
 
 

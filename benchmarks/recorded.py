@@ -5,12 +5,12 @@ This module knows nothing about what is measured, or in which order.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.clocks import CLOCKS, Clock
 from bot_runtime.bots import Bots
 from bot_runtime.bundle import Bundle
 from bot_runtime.golden import Golden
@@ -47,7 +47,7 @@ class RecordedFrames:
         return (frame + np.arange(self._n_bots)) % len(self._free_TF)
 
 
-def in_process(bundle: Bundle, golden: Golden, n_bots: int) -> Callable[[], Timed]:
+def in_process(bundle: Bundle, golden: Golden, n_bots: int, clock: Clock = "wall") -> Callable[[], Timed]:
     """A call that plays the next turn of `n_bots` new bots, both graphs, without a wire."""
     bots = Bots(bundle, max_bots=n_bots)
     handles = bots.start(n_bots)
@@ -59,7 +59,7 @@ def in_process(bundle: Bundle, golden: Golden, n_bots: int) -> Callable[[], Time
     def act(frame: int, query_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]) -> float:
         return bots.submit_features(handles, frame, query_NM, costly_ND).infer_us
 
-    return _turns(RecordedFrames(bundle.manifest.features, golden, n_bots), ask, act)
+    return _turns(RecordedFrames(bundle.manifest.features, golden, n_bots), ask, act, CLOCKS[clock])
 
 
 def over(client: BotClient, bundle: Bundle, golden: Golden, n_bots: int) -> Callable[[], Timed]:
@@ -74,26 +74,27 @@ def over(client: BotClient, bundle: Bundle, golden: Golden, n_bots: int) -> Call
     def act(frame: int, query_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]) -> float:
         return client.act(handles, frame, query_NM, costly_ND).infer_us
 
-    return _turns(RecordedFrames(bundle.manifest.features, golden, n_bots), ask, act)
+    return _turns(RecordedFrames(bundle.manifest.features, golden, n_bots), ask, act, CLOCKS["wall"])
 
 
 def _turns(
     frames: RecordedFrames,
     ask: Callable[[int, NDArray[np.float32]], tuple[NDArray[np.bool_], float]],
     act: Callable[[int, NDArray[np.bool_], NDArray[np.float32]], float],
+    now_ns: Callable[[], int],
 ) -> Callable[[], Timed]:
     frame = 0
 
     def turn() -> Timed:
         nonlocal frame
         free_NF = frames.free(frame)
-        begun = time.perf_counter_ns()
+        begun = now_ns()
         query_NM, asked_us = ask(frame, free_NF)
-        told = time.perf_counter_ns()
+        told = now_ns()
         known_ND = frames.known(frame, query_NM)
-        sent = time.perf_counter_ns()
+        sent = now_ns()
         acted_us = act(frame, query_NM, known_ND)
-        whole_us = (time.perf_counter_ns() - sent + told - begun) / 1e3
+        whole_us = (now_ns() - sent + told - begun) / 1e3
         frame += 1
         return whole_us, asked_us + acted_us
 
