@@ -14,6 +14,7 @@ from protocol.codec import Format
 from protocol.errors import InternalError, ProtocolError
 from protocol.messages import Error, Reply, Request
 from server.handlers import Handlers
+from server.recorder import Spans
 
 __all__ = ["Answer", "Arrival", "answer", "refusal"]
 
@@ -49,24 +50,36 @@ def answer(
     *,
     kind: type[Request] | None = None,
     reply_form: Format | None = None,
+    decoded_ns: int = 0,
 ) -> Answer:
     """Decode, handle, encode. `sent` is the body, or the request where it is decoded already; `arrival` is how it came.
 
-    `kind` is the message type where the door fixes it; `reply_form` is else `form`.
+    `kind` is the message type where the door fixes it; `reply_form` is else `form`; `decoded_ns` is when the request
+    was decoded, where it is.
     """
-    reply_form = reply_form or form
+    reply_form, clock = reply_form or form, time.monotonic_ns
+    started_ns = clock()
     try:
         if not isinstance(sent, bytes):
             request: Request = sent
+            wait_ns, decode_ns = started_ns - decoded_ns, decoded_ns - arrival.received_ns
         else:
             request = codec.decode_request(sent, form) if kind is None else codec.decode(sent, form, kind)
+            wait_ns, decode_ns = started_ns - arrival.received_ns, clock() - started_ns
         reply = handlers.handle(request, connection_id, reply_form)
-        return Answer(reply, codec.encode(reply, reply_form), 200)
+        handled_ns = clock()
+        encoded = codec.encode(reply, reply_form)
+        encoded_ns = clock()
+        spans = Spans(wait_ns, decode_ns, encoded_ns - handled_ns, encoded_ns - arrival.received_ns)
+        handlers.recorder.answered(arrival.transport, request, reply, spans)
+        return Answer(reply, encoded, 200)
     except ProtocolError as error:
-        return refusal(error, reply_form)
+        refused = error
     except Exception:
         _log.exception("a request failed")
-        return refusal(InternalError("the server failed to answer; its log says why"), reply_form)
+        refused = InternalError("the server failed to answer; its log says why")
+    handlers.recorder.refused(arrival.transport, refused.code)
+    return refusal(refused, reply_form)
 
 
 def refusal(error: ProtocolError, form: Format) -> Answer:

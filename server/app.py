@@ -13,12 +13,15 @@ from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, supp
 from functools import partial
 
 import uvicorn
+from fastapi import FastAPI
 
 from bot_runtime.bundle import Bundle
 from server.connections import Connections
 from server.desk import Desk
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
+from server.observation import watch
+from server.probes import Probes
 from server.serving import Serving
 from server.servings import Servings
 from server.settings import Settings
@@ -40,25 +43,28 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
     """
     servings = Servings(settings.max_bots)
     servings.activate(Serving(Bundle.load(settings.bundle), max_bots=settings.max_bots))
-    handlers = Handlers(servings, Connections(settings.max_connections, settings.idle_ttl_s, clock), settings.token)
+    connections = Connections(settings.max_connections, settings.idle_ttl_s, clock)
+    handlers = Handlers(servings, connections, settings.token)
     async with AsyncExitStack() as stack:
         worker = Worker(settings.max_queue)
         stack.callback(worker.close)
         desk = Desk(handlers, worker, inline_us=settings.inline_us)
-        http = HttpDoor(desk, worker, body_deadline_s=settings.frame_deadline_s)
-        uvicorn_server, http_address = await stack.enter_async_context(_http(settings, http))
         sockets = Sockets(
             desk,
             max_sockets=settings.max_connections,
             frame_deadline_s=settings.frame_deadline_s,
             idle_ttl_s=settings.idle_ttl_s,
         )
+        readiness, metrics = watch(settings, handlers, connections, worker, sockets)
+        http = HttpDoor(desk, worker, body_deadline_s=settings.frame_deadline_s)
+        application = create_app(http, Probes(handlers, readiness, metrics))
+        uvicorn_server, http_address = await stack.enter_async_context(_http(settings, application))
         addresses = {"http": http_address, **await stack.enter_async_context(_streams(settings, sockets))}
         await stack.enter_async_context(_sweeping(handlers, worker, settings.idle_ttl_s / 4))
         try:
             yield addresses
         finally:
-            http.ready = False
+            readiness.is_draining = True
             uvicorn_server.should_exit = True  # drains in its own task while the streams are drained here
 
 
@@ -71,11 +77,11 @@ class _Uvicorn(uvicorn.Server):
 
 
 @asynccontextmanager
-async def _http(settings: Settings, door: HttpDoor) -> AsyncIterator[tuple[uvicorn.Server, str]]:
+async def _http(settings: Settings, application: FastAPI) -> AsyncIterator[tuple[uvicorn.Server, str]]:
     listening = _listen(settings.host, settings.port)
     server = _Uvicorn(
         uvicorn.Config(
-            create_app(door),
+            application,
             http="httptools",
             ws="none",
             lifespan="off",

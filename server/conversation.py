@@ -24,7 +24,7 @@ class Conversation(asyncio.Protocol):
 
     def __init__(self, sockets: Sockets, name: str) -> None:
         self._sockets = sockets
-        self._name = name
+        self.name = name
         self._connection: str | None = None
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -122,7 +122,7 @@ class Conversation(asyncio.Protocol):
             self._wait()
             return
         self.is_busy, self._is_begun = True, False
-        arrival = Arrival.now(self._name)
+        arrival = Arrival.now(self.name)
         answered = self._sockets.desk.ask(body, Format.MSGPACK, self._connection, arrival)
         if isinstance(answered, Answer):
             self._reply(answered)

@@ -79,27 +79,29 @@ class Desk:
         """The answer, or the future of it. Arguments are those of `server.answer.answer`."""
         how = partial(answer, self.handlers, arrival=arrival, kind=kind, reply_form=reply_form)
         if len(body) > _MAX_INLINE_BYTES:
-            return self._hop(partial(how, body, form, connection_id), reply_form or form)
+            return self._hop(partial(how, body, form, connection_id), arrival, reply_form or form)
         try:
             request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)
         except ProtocolError:
             return how(body, form, connection_id)  # which refuses it, bots untouched
+        decoded = partial(how, request, form, connection_id, decoded_ns=time.monotonic_ns())
         if not isinstance(request, RequestQueries | SubmitFeatures):
-            return self._hop(partial(how, request, form, connection_id), reply_form or form)
+            return self._hop(decoded, arrival, reply_form or form)
         turn = type(request), len(request.bots).bit_length()
-        job = partial(self._timed, turn, partial(how, request, form, connection_id))
+        job = partial(self._timed, turn, decoded)
         if self._worker.is_idle and self._pace.expected_us(turn) <= self._inline_us:
             return job()
-        return self._hop(job, reply_form or form)
+        return self._hop(job, arrival, reply_form or form)
 
     def end(self, connection_id: str) -> None:
         """End a connection whose socket has closed, after what was asked for on it."""
         self._worker.post(partial(self.handlers.end, connection_id))
 
-    def _hop(self, job: Callable[[], Answer], form: Format) -> Answered:
+    def _hop(self, job: Callable[[], Answer], arrival: Arrival, form: Format) -> Answered:
         try:
             return self._worker.run(job)
         except NotReady as error:
+            self.handlers.recorder.refused(arrival.transport, error.code)
             return refusal(error, form)
 
     def _timed(self, turn: _Kind, job: Callable[[], Answer]) -> Answer:

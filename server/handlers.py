@@ -34,6 +34,7 @@ from protocol.messages import (
     Welcome,
 )
 from server.connections import Connection, Connections
+from server.recorder import Recorder
 from server.serving import Serving
 from server.servings import Servings
 
@@ -41,12 +42,16 @@ __all__ = ["Handlers"]
 
 
 class Handlers:
-    """Answers requests of known connections with bots of these servings. `token` is what Hello must carry, if any."""
+    """Answers requests of known connections with bots of these servings. `token` is what Hello must carry, if any.
+
+    `recorder` is where whoever hands on requests counts them.
+    """
 
     def __init__(self, servings: Servings, connections: Connections, token: str | None) -> None:
         self.servings = servings
         self._connections = connections
         self._token = token
+        self.recorder = Recorder()
 
     @property
     def max_body_bytes(self) -> dict[Format, int]:

@@ -26,7 +26,6 @@ from protocol.errors import (
     InternalError,
     MethodNotAllowed,
     NoRoute,
-    NotReady,
     ProtocolError,
     TooLarge,
     UnsupportedMediaType,
@@ -34,6 +33,7 @@ from protocol.errors import (
 from server.answer import Answer, Arrival, refusal
 from server.desk import Desk
 from server.openapi import CONNECTION_HEADER, ROUTES, document, summary
+from server.probes import Probes, check_bearer
 from server.worker import Worker
 
 __all__ = ["HttpDoor", "create_app"]
@@ -43,14 +43,13 @@ _BY_STATUS: dict[int, type[ProtocolError]] = {404: NoRoute, 405: MethodNotAllowe
 
 
 class HttpDoor:
-    """Answers HTTP requests; `ready` is what /readyz says."""
+    """Answers HTTP requests."""
 
     def __init__(self, desk: Desk, worker: Worker, *, body_deadline_s: float) -> None:
         self._desk = desk
         self._handlers = desk.handlers
         self._worker = worker
         self._body_deadline_s = body_deadline_s
-        self.ready = True
 
     async def exchange(self, request: Request, kind: type[messages.Request]) -> Response:
         """One message in, one message out."""
@@ -71,7 +70,7 @@ class HttpDoor:
     async def bundle(self, request: Request) -> Response:
         """What is served, without a connection; needs the token as `Authorization: Bearer` where there is one."""
         try:
-            self._check_bearer(request)
+            check_bearer(self._handlers, request)
             serving = await self._worker.run(partial(self._handlers.servings.named, None))
         except ProtocolError as error:
             return _refused(error, Format.JSON)
@@ -80,25 +79,11 @@ class HttpDoor:
     async def costs(self, request: Request) -> Response:
         """What acquiring costs each connected engine, as declared and as measured; needs the token as `bundle` does."""
         try:
-            self._check_bearer(request)
+            check_bearer(self._handlers, request)
             reports = await self._worker.run(self._handlers.costs)
         except ProtocolError as error:
             return _refused(error, Format.JSON)
         return Response(msgspec.json.encode(reports), media_type=Format.JSON.value)
-
-    async def healthz(self, request: Request) -> Response:
-        """The process answers."""
-        return Response(b'{"status":"ok"}', media_type=Format.JSON.value)
-
-    async def readyz(self, request: Request) -> Response:
-        """A new connection would be served."""
-        if not self.ready:
-            return _refused(NotReady("the server is draining", retry_after_s=1.0), Format.JSON)
-        return Response(b'{"status":"ready"}', media_type=Format.JSON.value)
-
-    def _check_bearer(self, request: Request) -> None:
-        scheme, _, token = request.headers.get("authorization", "").partition(" ")
-        self._handlers.check_token(token if scheme.lower() == "bearer" else None)
 
     async def _body(self, request: Request, form: Format) -> bytes:
         limit = self._handlers.max_body_bytes[form]
@@ -118,14 +103,15 @@ class HttpDoor:
         return bytes(body)
 
 
-def create_app(door: HttpDoor) -> FastAPI:
+def create_app(door: HttpDoor, probes: Probes) -> FastAPI:
     """The application: message routes, documentation at /docs, and probes."""
     app = FastAPI(title="Budgeted bot runtime", version=str(messages.PROTOCOL_VERSION), redoc_url=None)
     for path, (kind, _) in ROUTES.items():  # starlette's own routes: FastAPI's take a third longer a request
         app.router.routes.append(Route(path, _endpoint(door, kind), methods=["POST"]))
-    probes = {"/v1/bundle": door.bundle, "/v1/costs": door.costs, "/healthz": door.healthz, "/readyz": door.readyz}
-    for path, probe in probes.items():
-        app.add_api_route(path, probe, methods=["GET"], response_class=Response)
+    views = {"/v1/bundle": door.bundle, "/v1/costs": door.costs}
+    views |= {"/healthz": probes.healthz, "/readyz": probes.readyz, "/metrics": probes.metrics}
+    for path, view in views.items():
+        app.add_api_route(path, view, methods=["GET"], response_class=Response)
     app.add_exception_handler(HTTPException, _http_refusal)
     app.add_exception_handler(Exception, _internal)
     document(app)

@@ -39,6 +39,8 @@ class Settings:
     """A connection that is silent for this long ends, and its bots with it."""
     frame_deadline_s: float = 3.0
     """A client has this long to send one whole request, and to take one whole reply."""
+    stuck_after_s: float = 2.0
+    """Not ready while one piece of the inference thread's work has been running for this long."""
     drain_s: float = 5.0
     """After SIGTERM, requests in progress have this long to finish."""
     token: str | None = None
@@ -51,8 +53,8 @@ class Settings:
     def __post_init__(self) -> None:
         if min(self.max_bots, self.max_connections, self.max_queue) < 1:
             raise ValueError("max_bots, max_connections and max_queue must be at least 1")
-        if min(self.idle_ttl_s, self.frame_deadline_s, self.drain_s) <= 0:
-            raise ValueError("idle_ttl_s, frame_deadline_s and drain_s must be positive")
+        if min(self.idle_ttl_s, self.frame_deadline_s, self.stuck_after_s, self.drain_s) <= 0:
+            raise ValueError("idle_ttl_s, frame_deadline_s, stuck_after_s and drain_s must be positive")
         if not self.inline_us >= 0:
             raise ValueError("inline_us must not be negative")
         if self.token == "":

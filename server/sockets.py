@@ -6,6 +6,7 @@ This module knows nothing about what travels on them.
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from typing import Protocol
 
 from protocol.errors import TooManyConnections
@@ -15,6 +16,10 @@ __all__ = ["Sockets"]
 
 
 class _Open(Protocol):
+    @property
+    def name(self) -> str:
+        """The transport's, as in Arrival."""
+
     @property
     def is_busy(self) -> bool:
         """Whether a request of it is being answered."""
@@ -44,6 +49,10 @@ class Sockets:
 
     def __len__(self) -> int:
         return len(self._open)
+
+    def by_transport(self) -> dict[str, int]:
+        """How many there are, by the transport's name."""
+        return dict(Counter(socket.name for socket in tuple(self._open)))
 
     def add(self, socket: _Open) -> None:
         """One more is open; raises TooManyConnections."""

@@ -10,6 +10,7 @@ import asyncio
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -22,10 +23,15 @@ _log = logging.getLogger(__name__)
 
 
 class Worker:
-    """A thread and its bounded queue. Everything but the thread itself is for the event loop's thread only."""
+    """A thread and its bounded queue. All but `busy_s` and the thread itself is for the event loop's thread only.
 
-    def __init__(self, max_queue: int) -> None:
-        self._max_queue = max_queue
+    `clock` counts seconds.
+    """
+
+    def __init__(self, max_queue: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self.max_queue = max_queue
+        self._clock = clock
+        self._busy_since_s: float | None = None
         self._taken = 0  # jobs that were put into the queue: the event loop alone counts them
         self._done = 0  # jobs that have ended: the thread alone counts them
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
@@ -37,11 +43,20 @@ class Worker:
         """Whether nothing runs or waits here: until the next `run` or `post` the event loop has the bots to itself."""
         return self._taken == self._done
 
+    @property
+    def n_waiting(self) -> int:
+        """Jobs that wait here, with the one that runs."""
+        return self._taken - self._done
+
+    def busy_s(self) -> float:
+        """How long ago the job began that runs now, in s; 0 where none does. From any thread."""
+        since_s = self._busy_since_s
+        return 0.0 if since_s is None else self._clock() - since_s
+
     def run(self, job: Callable[[], T]) -> asyncio.Future[T]:
         """The job's result to be, or what it raises. Raises NotReady at once when too many jobs wait already."""
-        waiting = self._taken - self._done
-        if waiting >= self._max_queue:
-            raise NotReady(f"{waiting} requests are waiting already", retry_after_s=0.1)
+        if self.n_waiting >= self.max_queue:
+            raise NotReady(f"{self.n_waiting} requests are waiting already", retry_after_s=0.1)
         outcome: asyncio.Future[T] = asyncio.get_running_loop().create_future()
         self._put(_Job(job, outcome))
         return outcome
@@ -61,10 +76,12 @@ class Worker:
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
+            self._busy_since_s = self._clock()
             try:
                 result, error = job.call(), None
             except Exception as raised:
                 result, error = None, raised
+            self._busy_since_s = None
             self._done += 1  # before anyone is told: whoever is may put the next job at once
             job.tell(result, error)
 

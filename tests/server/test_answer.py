@@ -15,6 +15,7 @@ from protocol.codec import MAX_DETAIL_CHARS, Format
 from protocol.errors import TooManyBots
 from server import desk
 from server.answer import Answer, Arrival, answer, refusal
+from server.recorder import Recorder
 from tests.server.serving import Served
 
 
@@ -23,13 +24,14 @@ def _failing(*_: object) -> None:
 
 
 def test_a_failure_is_internal_and_its_traceback_stays_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    recorder = Recorder()
+    handlers = SimpleNamespace(handle=_failing, recorder=recorder)
     with caplog.at_level(logging.ERROR):
-        answered = answer(
-            SimpleNamespace(handle=_failing), b'{"type":"goodbye"}', Format.JSON, None, Arrival.now("tcp")
-        )
+        answered = answer(handlers, b'{"type":"goodbye"}', Format.JSON, None, Arrival.now("tcp"))
     assert (answered.status, json.loads(answered.body)["code"]) == (500, "INTERNAL")
     assert b"secret" not in answered.body
     assert "secret /path" in caplog.text
+    assert (recorder.answers, recorder.refusals) == ({}, {("tcp", "INTERNAL"): 1})
 
 
 def test_a_refusal_is_bounded_and_says_when_to_try_again() -> None:

@@ -1,27 +1,18 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fastapi import FastAPI
 
-from bot_runtime.bundle import Bundle
 from protocol.errors import BadBundle
 from server import app
 from server.app import _listen, running
-from server.connections import Connections
-from server.desk import Desk
-from server.handlers import Handlers
-from server.http import HttpDoor, create_app
-from server.serving import Serving
-from server.servings import Servings
+from server.observation import Observation, watch
 from server.settings import Settings
 from server.sockets import Sockets
-from server.worker import Worker
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
@@ -48,57 +39,26 @@ def test_http_and_tcp_listen_on_such_sockets(bundle: Path, monkeypatch: pytest.M
     assert asyncio.run(main()) == ports
 
 
-def test_a_draining_door_is_alive_and_not_ready(bundle: Path) -> None:
-    worker = Worker(1)
-    servings = Servings(max_bots=1)
-    servings.activate(Serving(Bundle.load(bundle), max_bots=1))
-    handlers = Handlers(servings, Connections(1, 1.0), None)
-    door = HttpDoor(Desk(handlers, worker, inline_us=0.0), worker, body_deadline_s=1.0)
-    application = create_app(door)
-
-    def get(path: str) -> tuple[int, dict[str, Any], dict[bytes, bytes]]:
-        sent: list[dict[str, Any]] = []
-
-        async def receive() -> dict[str, Any]:
-            return {"type": "http.request", "body": b"", "more_body": False}
-
-        async def send(message: dict[str, Any]) -> None:
-            sent.append(message)
-
-        scope = {"type": "http", "method": "GET", "path": path, "headers": [], "query_string": b"", "root_path": ""}
-        asyncio.run(application(scope, receive, send))
-        return sent[0]["status"], json.loads(sent[1]["body"]), dict(sent[0]["headers"])
-
-    try:
-        assert get("/readyz")[:2] == (200, {"status": "ready"})
-        door.ready = False
-        status, refused, headers = get("/readyz")
-        assert (status, refused["code"], headers[b"retry-after"]) == (503, "NOT_READY", b"1")
-        assert get("/healthz")[:2] == (200, {"status": "ok"})
-    finally:
-        worker.close()
-
-
 def test_a_server_that_ends_is_not_ready_before_it_drains(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    doors: list[HttpDoor] = []
-    ready_when_draining: list[bool] = []
+    observed: list[Observation] = []
+    failing_when_draining: list[dict[str, str]] = []
 
-    def remember(door: HttpDoor) -> FastAPI:
-        doors.append(door)
-        return create_app(door)
+    def remember(*parts: Any) -> Observation:
+        observed.append(watch(*parts))
+        return observed[0]
 
     async def drain(*_: object) -> None:
-        ready_when_draining.append(doors[0].ready)
+        failing_when_draining.append(observed[0].readiness.failing())
 
-    monkeypatch.setattr(app, "create_app", remember)
+    monkeypatch.setattr(app, "watch", remember)
     monkeypatch.setattr(Sockets, "drain", drain)
 
     async def main() -> None:
         async with running(Settings(bundle=bundle, port=0)):
-            assert doors[0].ready
+            assert observed[0].readiness.failing() == {}
 
     asyncio.run(main())
-    assert ready_when_draining == [False]
+    assert [list(failing) for failing in failing_when_draining] == [["drain"]]
 
 
 def test_a_server_that_cannot_start_leaves_nothing_behind(bundle: Path, tmp_path: Path) -> None:

@@ -1,0 +1,99 @@
+"""What every answered request leaves behind: counts in buckets that fit microseconds, cheap enough for every request.
+
+This module knows nothing about Prometheus, sockets or bots. Whoever answers counts: one request at a time, be it on
+the worker's thread or on the event loop. Refusals may come from both, so they alone take a lock. Whoever reads sees
+plain integers that only grow, each right by itself, and at most one request apart from each other.
+"""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_left
+from typing import NamedTuple
+
+from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures
+
+__all__ = ["BATCH_BOUNDS", "NS_BOUNDS", "PHASES", "WHOLE", "Histograms", "Recorder", "Spans"]
+
+# 1 µs to 3 s. 16,667 and 33,333 µs are frames at 60 and 30 Hz.
+_BOUNDS_US = (1, 2, 3.5, 5, 7.5, 10, 15, 20, 30, 40, 50, 65, 80, 100, 130, 170, 220, 300, 400, 600, 1_000, 2_000, 5_000)
+_LONG_BOUNDS_US = (10_000, 16_667, 33_333, 100_000, 300_000, 1_000_000, 3_000_000)
+NS_BOUNDS = tuple(round(bound_us * 1e3) for bound_us in (*_BOUNDS_US, *_LONG_BOUNDS_US))
+BATCH_BOUNDS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
+PHASES = ("wait", "decode", "inference", "encode")
+WHOLE = len(PHASES)  # the histogram after those of the phases
+_HALF_TURNS, _HALF_REPLIES = (RequestQueries, SubmitFeatures), (Queries, Actions)
+
+
+class Spans(NamedTuple):
+    """How long one request took, in ns: waiting for its turn, decoding, encoding, and from received to encoded."""
+
+    wait_ns: int
+    decode_ns: int
+    encode_ns: int
+    whole_ns: int
+
+
+class Histograms:
+    """Of one transport's requests of one type: ns in each phase, ns of the whole, and bots a message.
+
+    `counts[i][j]` is how many of histogram i fell at or below bound j and above the one before it, `totals[i]` their
+    sum. Where a message is no half of a turn, only the whole is counted.
+    """
+
+    __slots__ = ("batches", "bots", "counts", "totals")
+
+    def __init__(self) -> None:
+        self.counts = tuple([0] * (len(NS_BOUNDS) + 1) for _ in range(WHOLE + 1))
+        self.totals = [0] * (WHOLE + 1)
+        self.batches = [0] * (len(BATCH_BOUNDS) + 1)
+        self.bots = 0
+
+    def count(self, whole_ns: int) -> None:
+        """Add one request."""
+        self.counts[WHOLE][bisect_left(NS_BOUNDS, whole_ns)] += 1
+        self.totals[WHOLE] += whole_ns
+
+    def count_half_turn(self, spans: Spans, infer_us: float, n_bots: int) -> None:
+        """Add one request in all its phases. Written out rather than looped over, which takes twice as long."""
+        wait_ns, decode_ns, encode_ns, whole_ns = spans
+        infer_ns = int(infer_us * 1e3)
+        waits, decodes, inferences, encodes, wholes = self.counts
+        waits[bisect_left(NS_BOUNDS, wait_ns)] += 1
+        decodes[bisect_left(NS_BOUNDS, decode_ns)] += 1
+        inferences[bisect_left(NS_BOUNDS, infer_ns)] += 1
+        encodes[bisect_left(NS_BOUNDS, encode_ns)] += 1
+        wholes[bisect_left(NS_BOUNDS, whole_ns)] += 1
+        totals = self.totals
+        totals[0] += wait_ns
+        totals[1] += decode_ns
+        totals[2] += infer_ns
+        totals[3] += encode_ns
+        totals[4] += whole_ns
+        self.batches[bisect_left(BATCH_BOUNDS, n_bots)] += 1
+        self.bots += n_bots
+
+
+class Recorder:
+    """What was answered, by transport and type of request, and what was refused, by transport and code."""
+
+    def __init__(self) -> None:
+        self.answers: dict[tuple[str, type[Request]], Histograms] = {}
+        self.refusals: dict[tuple[str, str], int] = {}
+        self._refusing = threading.Lock()
+
+    def answered(self, transport: str, request: Request, reply: Reply, spans: Spans) -> None:
+        """Count one request that was answered as it asked for. Not thread-safe: one request is answered at a time."""
+        key = transport, type(request)
+        histograms = self.answers.get(key)
+        if histograms is None:
+            histograms = self.answers[key] = Histograms()
+        if isinstance(reply, _HALF_REPLIES) and isinstance(request, _HALF_TURNS):
+            histograms.count_half_turn(spans, reply.infer_us, len(request.bots))
+        else:
+            histograms.count(spans.whole_ns)
+
+    def refused(self, transport: str, code: str) -> None:
+        """Count one request that was refused with this code; from any thread."""
+        with self._refusing:
+            self.refusals[transport, code] = self.refusals.get((transport, code), 0) + 1

@@ -1,0 +1,123 @@
+"""/metrics of a real server: what engines did is what it says, in the format that Prometheus reads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from protocol.client import BotClient
+from protocol.errors import NoBot
+from tests.protocol.golden import TABLE
+from tests.server.serving import Served, costly_numbers, free_numbers, http_request, play, serve
+
+N = 3
+
+
+class Scrape:
+    """One answer of /metrics, read by Prometheus' own parser."""
+
+    def __init__(self, served: Served, **headers: str) -> None:
+        answer = http_request(served.addresses["http"], "GET", "/metrics", headers=headers)
+        assert answer.status == 200
+        assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+        self.families = {family.name: family for family in text_string_to_metric_families(answer.body.decode())}
+        self.samples = [sample for family in self.families.values() for sample in family.samples]
+
+    def __call__(self, name: str, **labels: str) -> float:
+        """The sum of the samples of this name with these labels, and whatever others."""
+        found = [
+            s.value for s in self.samples if s.name == f"bot_runtime_{name}" and labels.items() <= s.labels.items()
+        ]
+        assert found, f"no {name} with {labels}"
+        return sum(found)
+
+
+@pytest.fixture
+def server(bundle: Path, tmp_path: Path) -> Served:
+    with serve(bundle, tmp_path / "s", max_bots=8, max_connections=5) as running:
+        yield running
+
+
+@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+def test_what_happened_is_what_it_says(server: Served, door: str) -> None:
+    with BotClient(server.addresses[door]) as client:
+        client.hello()
+        bots = client.start(N)
+        play(client, TABLE, bots, range(4))
+        client.query(bots, 7, free_numbers(TABLE, N, 7))
+        client.query(bots, 9, free_numbers(TABLE, N, 9))
+        with pytest.raises(NoBot):
+            client.query(np.array([1]), 9, free_numbers(TABLE, 1, 9))
+        scrape = Scrape(server)
+        for message, n in (("hello", 1), ("start_bots", 1), ("request_queries", 6), ("submit_features", 4)):
+            assert scrape("request_seconds_count", transport=door, message=message) == n
+        for phase in ("wait", "decode", "inference", "encode"):
+            assert scrape("request_phase_seconds_count", message="submit_features", phase=phase) == 4
+        assert scrape("request_phase_seconds_bucket", message="request_queries", phase="inference", le="+Inf") == 6
+        parts_s = scrape("request_phase_seconds_sum", message="request_queries")
+        assert 0.0 < parts_s < scrape("request_seconds_sum", message="request_queries")
+        assert scrape("message_bots_sum", message="submit_features") == 4 * N
+        assert scrape("message_bots_bucket", message="submit_features", le="2") == 0
+        assert scrape("actions_total", bundle="tiny", reason="learned") == 4 * N
+        assert scrape("actions_total", reason="non_finite_step_safe_action") == 0
+        assert scrape("refused_total", transport=door, code="NO_BOT") == 1
+        assert scrape("skipped_frames_total") == N * (3 + 1)
+        assert scrape("abandoned_queries_total") == N
+        assert (scrape("bots"), scrape("bots_limit")) == (N, 8)
+        assert (scrape("connections"), scrape("connections_limit"), scrape("bundle_connections")) == (1, 5, 1)
+        assert (scrape("queue_length"), scrape("queue_limit"), scrape("ready")) == (0, 64, 1)
+        assert scrape("bundle_info", bundle="tiny", method="bdt", precision="float32") == 1
+    assert {"process_resident_memory_bytes", "process_open_fds", "process_cpu_seconds"} <= set(scrape.families)
+
+
+def test_budgets_and_measured_costs(server: Served) -> None:
+    with BotClient(server.addresses["unix"]) as client:
+        client.hello()
+        bots = client.start(N, budgets_us=[1e6] * N)
+        predicted_us, measured_us, allowed_us = 0.0, 0.0, 10.0
+        for frame in range(20):
+            queries = client.query(bots, frame, free_numbers(TABLE, N, frame), frame_budget_us=allowed_us)
+            predicted_us += queries.cost_us.sum()
+            acquire_us = 25.0 if queries.queries.any() else None
+            measured_us += acquire_us or 0.0
+            client.act(bots, frame, queries.queries, costly_numbers(TABLE, N, frame), acquire_us=acquire_us)
+        scrape = Scrape(server)
+    n = measured_us / 25.0
+    assert n > 10
+    assert scrape("query_cost_seconds_total") == pytest.approx(predicted_us / 1e6)
+    assert scrape("budget_allowed_seconds_total") == pytest.approx(20 * allowed_us / 1e6)
+    assert scrape("acquire_measured_seconds_total") == pytest.approx(measured_us / 1e6)
+    assert scrape("acquire_predicted_seconds_total") == pytest.approx(predicted_us / 1e6)
+    assert scrape("acquire_error_seconds_total") >= (measured_us - predicted_us) / 1e6 - 1e-12
+    assert scrape("frames_measured_total") == scrape("frames_over_budget_total") == n
+    assert 0 < scrape("frames_over_predicted_total") <= n
+
+
+def test_nothing_secret_and_every_name_by_the_conventions(server: Served) -> None:
+    with BotClient(server.addresses["tcp"]) as client:
+        welcome = client.hello()
+        play(client, TABLE, client.start(1), range(2))
+        scrape = Scrape(server)
+    assert not any(welcome.connection in json.dumps(sample.labels) for sample in scrape.samples)
+    for family in scrape.families.values():
+        if not family.name.startswith(("bot_runtime_", "process_")):
+            pytest.fail(family.name)
+        assert family.documentation
+        assert family.type in ("counter", "gauge", "histogram"), family
+        assert not family.name.endswith(("_us", "_ms", "_total"))
+
+
+def test_metrics_need_the_token(bundle: Path, tmp_path: Path) -> None:
+    with serve(bundle, tmp_path / "s", token="s3cret") as guarded:
+        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "s3cret"}):
+            refused = http_request(guarded.addresses["http"], "GET", "/metrics", headers=headers)
+            assert (refused.status, json.loads(refused.body)["code"]) == (401, "UNAUTHORIZED")
+        scrape = Scrape(guarded, Authorization="Bearer s3cret")
+        assert (scrape("bots"), scrape("connections")) == (0, 0)
+        assert not any("s3cret" in str(sample) for sample in scrape.samples)
+        for path in ("/healthz", "/readyz"):
+            assert http_request(guarded.addresses["http"], "GET", path).status == 200

@@ -1,0 +1,47 @@
+"""Counting: every number in the bucket that it belongs to, every request once."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.messages import Farewell, Goodbye, Queries, RequestQueries
+from server.recorder import NS_BOUNDS, PHASES, WHOLE, Recorder, Spans
+
+REQUEST = RequestQueries(frame=1, bots=[1, 2, 3], free=b"")
+ns = st.integers(0, 2 * NS_BOUNDS[-1]) | st.sampled_from([bound + off for bound in NS_BOUNDS for off in (-1, 0, 1)])
+
+
+@given(st.lists(st.tuples(ns, ns, ns, ns, st.floats(0.0, 1e7)), min_size=1, max_size=20))
+def test_every_phase_is_in_its_bucket(durations: list[tuple[int, int, int, int, float]]) -> None:
+    """Against the definition: le is inclusive."""
+    recorder, expected = Recorder(), []
+    for wait, decode, handle, encode, infer_us in durations:
+        spans = Spans(wait, decode, encode, wait + decode + handle + encode)
+        reply = Queries(frame=1, queries=b"", cost_us=[], infer_us=infer_us)
+        recorder.answered("tcp", REQUEST, reply, spans)
+        expected.append((wait, decode, int(infer_us * 1e3), encode, spans.whole_ns))
+    histograms = recorder.answers["tcp", RequestQueries]
+    assert len(PHASES) == WHOLE == 4
+    for index, numbers in enumerate(zip(*expected, strict=True)):
+        cumulative = np.cumsum(histograms.counts[index])
+        assert [sum(number <= bound for number in numbers) for bound in NS_BOUNDS] == cumulative[:-1].tolist()
+        assert (cumulative[-1], histograms.totals[index]) == (len(numbers), sum(numbers))
+    assert (histograms.bots, sum(histograms.batches)) == (3 * len(durations), len(durations))
+    assert histograms.batches[2] == len(durations)  # 3 bots: above 2, at most 4
+
+
+def test_what_is_no_turn_has_no_phases() -> None:
+    recorder = Recorder()
+    recorder.answered("http", Goodbye(), Farewell(), Spans(1, 2, 3, 1500))
+    histograms = recorder.answers["http", Goodbye]
+    assert (sum(histograms.counts[WHOLE]), histograms.totals) == (1, [0, 0, 0, 0, 1500])
+    assert not any(histograms.batches)
+
+
+def test_refusals_are_counted_by_transport_and_code() -> None:
+    recorder = Recorder()
+    for transport, code in (("tcp", "NO_BOT"), ("tcp", "NO_BOT"), ("http", "NO_BOT"), ("tcp", "NOT_READY")):
+        recorder.refused(transport, code)
+    assert recorder.refusals == {("tcp", "NO_BOT"): 2, ("http", "NO_BOT"): 1, ("tcp", "NOT_READY"): 1}
