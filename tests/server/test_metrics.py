@@ -29,9 +29,8 @@ class Scrape:
 
     def __call__(self, name: str, **labels: str) -> float:
         """The sum of the samples of this name with these labels, and whatever others."""
-        found = [
-            s.value for s in self.samples if s.name == f"bot_runtime_{name}" and labels.items() <= s.labels.items()
-        ]
+        named = [sample for sample in self.samples if sample.name == f"bot_runtime_{name}"]
+        found = [sample.value for sample in named if labels.items() <= sample.labels.items()]
         assert found, f"no {name} with {labels}"
         return sum(found)
 
@@ -87,7 +86,7 @@ def test_budgets_and_measured_costs(server: Served) -> None:
             client.act(bots, frame, queries.queries, costly_numbers(TABLE, N, frame), acquire_us=acquire_us)
         scrape = Scrape(server)
     n = measured_us / 25.0
-    assert n > 10
+    assert n >= 3
     assert scrape("query_cost_seconds_total") == pytest.approx(predicted_us / 1e6)
     assert scrape("budget_allowed_seconds_total") == pytest.approx(20 * allowed_us / 1e6)
     assert scrape("acquire_measured_seconds_total") == pytest.approx(measured_us / 1e6)
