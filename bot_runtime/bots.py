@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bot_runtime import inputs
+from bot_runtime.asking import Asking
+from bot_runtime.batch import Batch
 from bot_runtime.bundle import Bundle
-from bot_runtime.company import Companies, Company, Means
+from bot_runtime.company import Companies, Company
 from bot_runtime.context import Contexts
 from bot_runtime.costs import MAX_ACQUIRE_US, Costs
-from bot_runtime.draw import draw
 from bot_runtime.fallback import Counters
 from bot_runtime.policy import Policy
+from bot_runtime.request import NOTHING_SAID, Numbers, Request
 from bot_runtime.slots import Slots
 from bot_runtime.spending import Limits, Spending
 from bot_runtime.spent import Spent
@@ -29,14 +31,14 @@ from bot_runtime.step import Step
 from bot_runtime.turns import Actions, Queries, Turn, Turns
 from protocol.errors import BadSchema, FrameReused
 from protocol.features import CostModel
-from protocol.messages import MAX_RETURN
+from protocol.messages import MAX_RETURN, MAX_RETURN_TO_GO
+from protocol.turn import Event
 from protocol.values import check_frame
 
 __all__ = ["Bots"]
 
 _Handles = NDArray[np.int64]
-_Numbers = Sequence[float] | NDArray[np.floating] | None
-_NOTHING_SAID = Limits.checked(0, None, None)
+_Floats = NDArray[np.float64]
 
 
 class Bots:
@@ -59,12 +61,12 @@ class Bots:
         self.bundle = bundle
         self.counters = Counters()
         self.spent = Spent()
-        self._clock = clock
         self._policy = Policy(bundle)
         generation = secrets.randbits(31) if first_generation is None else first_generation
         self._slots = Slots(max_bots, first_generation=generation)
         self._contexts = Contexts(bundle.manifest, max_bots)
         self._turns = Turns(max_bots, self.counters)
+        self._asking = Asking(bundle.manifest.features.n_queries, self._contexts, clock)
         self._step = Step(bundle.manifest, self._contexts, self.counters, clock)
         self._spending = Spending(bundle.manifest, max_bots)
         self._companies = Companies(self._slots, self._contexts, self._spending)
@@ -86,16 +88,18 @@ class Bots:
         count: int,
         *,
         seeds: Sequence[int] | NDArray[np.uint64] | None = None,
-        target_returns: _Numbers = None,
-        budgets_us: _Numbers = None,
-        target_costs_us: _Numbers = None,
+        target_returns: Numbers = None,
+        budgets_us: Numbers = None,
+        target_costs_us: Numbers = None,
         cost_model: CostModel | None = None,
+        turns: Sequence[int] | None = None,
     ) -> _Handles:
         """Start bots and return their handles, int64 [count].
 
         Defaults: the n-th bot started here has seed n; the bundle's target return and budget (none at all when it
         was trained without a limit); the costs that the feature table declares; a target cost as large as the budget,
-        where one is given, else the bundle's. Raises BadSchema, BadShape, NonFinite, OutOfRange, TooManyBots.
+        where one is given, else the bundle's; no `turns`, which are those that bots of before took at a server that is
+        gone, to be replayed. Raises BadSchema, BadShape, NonFinite, OutOfRange, TooManyBots.
         """
         if count < 1:
             raise BadSchema(f"count is {count}, expected at least 1")
@@ -108,9 +112,10 @@ class Bots:
         limits = Limits.checked(count, budgets_us, target_costs_us)
         numbered = range(self._started, self._started + count)
         seeds_N = inputs.seeds(numbered if seeds is None else seeds, count)
+        turns_N = None if turns is None else inputs.turns(turns, count)
         slots_N = self._slots.take(count)
         self._started += count
-        self._contexts.begin(slots_N, seeds_N, returns_N)
+        self._contexts.begin(slots_N, seeds_N, returns_N, turns_N)
         self._spending.begin(slots_N, model, limits)
         return self._slots.handles(slots_N)
 
@@ -119,10 +124,10 @@ class Bots:
         handles: _Handles,
         frame: int,
         free_NF: NDArray[np.float32],
-        rewards_N: _Numbers = None,
+        rewards_N: Numbers = None,
         frame_budget_us: float | None = None,
-        budgets_us: _Numbers = None,
-        target_costs_us: _Numbers = None,
+        budgets_us: Numbers = None,
+        target_costs_us: Numbers = None,
         costs: Costs | None = None,
     ) -> Queries:
         """What each bot asks for in this frame, within its own budget and, together, within `frame_budget_us`.
@@ -133,28 +138,19 @@ class Bots:
         start for this frame. A newer frame abandons a pending query. Raises BadShape, BadSchema,
         NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
         """
-        company = self._companies.named(handles, _NOTHING_SAID)
+        company = self._companies.named(handles, NOTHING_SAID)
         check_frame(frame)
-        retried = self._turns.query(company, frame)
-        self._checks.free(free_NF, handles)
-        if rewards_N is None:
-            rewards_N = np.zeros(company.n_bots)
-        else:
-            rewards_N = inputs.per_bot("rewards", rewards_N, company.n_bots, -MAX_RETURN, MAX_RETURN)
-        limits, means = _NOTHING_SAID, company.means
-        if any(said is not None for said in (budgets_us, target_costs_us, frame_budget_us, costs)):
-            limits = Limits.checked(company.n_bots, budgets_us, target_costs_us, frame_budget_us)
-            means = Means.of(self._spending.terms(company.slots_N, limits, costs))
-        request = (free_NF.copy(), rewards_N, *limits)
+        retried = self._turns.begun(company, frame, Event.QUERY)
+        said = self._request(company, free_NF, rewards_N, frame_budget_us, budgets_us, target_costs_us, costs)
         if retried is not None:
-            _check_same(request, retried.request, frame)
+            _check_same(said.content, retried.request, frame)
             return retried.queries
-        returns_to_go_N = self._contexts.returns_to_go(company.batch) - rewards_N
-        turn = self._ask(company, frame, request, returns_to_go_N, means, limits.frame_budget_us)
+        returns_to_go_N = self._contexts.returns_to_go(company.batch) - said.rewards_N
+        turn = self._asking.ask(self._policy, company, frame, said, returns_to_go_N)
         self._contexts.spend(company.batch, returns_to_go_N)
         company.batch.keep_prepared()
         self._turns.begin(company, turn)
-        self.spent.ask(turn.queries.cost_us_N, min(means.allowed_us, turn.budget_us))
+        self.spent.ask(turn.queries.cost_us_N, min(said.means.allowed_us, turn.budget_us))
         return turn.queries
 
     def submit_features(
@@ -174,26 +170,72 @@ class Bots:
         Raises BadShape, BadSchema, NoBot, StaleFrame, NoPendingQuery, UnrequestedFeature, MissingFeature, NonFinite,
         OutOfRange, FrameReused.
         """
-        company = self._companies.named(handles, _NOTHING_SAID)
+        company = self._companies.named(handles, NOTHING_SAID)
         check_frame(frame)
         turn, batch = self._turns.features(company, frame), company.batch
         staged_ND = batch.costly_ND if turn.actions is None else np.empty_like(batch.costly_ND)
         query_NM = turn.queries.query_NM
         known_NM = self._checks.costly(acquired_NM, costly_ND, failed_NM, query_NM, handles, staged_ND)
-        measured = () if acquire_us is None else (acquire_us,)
-        measured_us = inputs.per_bot("acquire_us", measured, len(measured), 0.0, MAX_ACQUIRE_US)
+        measured_us = _measured(acquire_us)
         if turn.actions is not None:
             kept = (*self._contexts.acquired(batch), turn.measured_us)
             _check_same((staged_ND, known_NM, measured_us), kept, frame)
             return turn.actions
-        np.copyto(batch.query_NM, known_NM)
-        turn.actions, turn.measured_us = self._step.act(self._policy, turn, batch), measured_us
-        batch.keep_acquired()
-        if acquire_us is not None and costs is not None:
-            predicted_us = costs.observe(acquired_NM, acquire_us)
-            if predicted_us is not None:
-                self.spent.measure(acquire_us, predicted_us, turn.budget_us)
-        return turn.actions
+        return self._answer(turn, batch, acquired_NM, known_NM, measured_us, costs)
+
+    def take_turn(
+        self,
+        handles: _Handles,
+        frame: int,
+        free_NF: NDArray[np.float32],
+        acquired_NM: NDArray[np.bool_],
+        costly_ND: NDArray[np.float32],
+        failed_NM: NDArray[np.bool_] | None = None,
+        rewards_N: Numbers = None,
+        frame_budget_us: float | None = None,
+        budgets_us: Numbers = None,
+        target_costs_us: Numbers = None,
+        acquire_us: float | None = None,
+        costs: Costs | None = None,
+        replayed_returns_to_go: Numbers = None,
+    ) -> Actions:
+        """Both halves at once, where the engine has decided what to acquire: what it acquired or failed is the query.
+
+        The same as a query that came out so and its features. Where `replayed_returns_to_go` is given, the turn was
+        taken before, at a server that is gone, and each bot then had so much left: what it has now stays, and budgets
+        are not looked at. Raises what the halves raise (but NoPendingQuery and what compares with a query), OverBudget.
+        """
+        company = self._companies.named(handles, NOTHING_SAID)
+        check_frame(frame)
+        retried, batch = self._turns.begun(company, frame, Event.TURN), company.batch
+        known = costs if costs is not None and costs.n_frames else None  # else those of the bots' start, at hand
+        said = self._request(company, free_NF, rewards_N, frame_budget_us, budgets_us, target_costs_us, known)
+        left_N, replayed_N = self._left(company, said, rewards_N, replayed_returns_to_go)
+        query_NM, staged_ND = self._checks.query(acquired_NM, failed_NM, handles), np.empty_like(batch.costly_ND)
+        known_NM = self._checks.costly(acquired_NM, costly_ND, failed_NM, query_NM, handles, staged_ND)
+        measured_us, request = _measured(acquire_us), (*said.content, query_NM, replayed_N)
+        if retried is not None and retried.actions is not None:
+            kept = (*retried.request, *self._contexts.acquired(batch), retried.measured_us)
+            _check_same((*request, staged_ND, known_NM, measured_us), kept, frame)
+            return retried.actions
+        cost_us_N = said.means.cost_us(query_NM)
+        if not replayed_N.size:
+            said.means.check(cost_us_N, said.limits.frame_budget_us)
+        queries = Queries(frame, query_NM, cost_us_N, batch.probs_NM, 0.0)
+        turn = self._asking.decided(self._policy, company, said, left_N, queries)
+        turn.request = request
+        batch.keep_prepared()
+        np.copyto(batch.costly_ND, staged_ND)
+        actions = self._answer(turn, batch, acquired_NM, known_NM, measured_us, costs)
+        if not replayed_N.size:
+            self._contexts.spend(batch, left_N)
+            self.spent.ask(cost_us_N, min(said.means.allowed_us, turn.budget_us))
+        self._turns.begin(company, turn)
+        return actions
+
+    def hidden(self, handles: _Handles) -> NDArray[np.float32]:
+        """Each bot's hidden state after its last turn, a copy, [N, W]. Raises BadShape, BadSchema, NoBot."""
+        return self._contexts.hidden(self._companies.named(handles, NOTHING_SAID).batch)
 
     def stop(self, handles: _Handles) -> int:
         """End these bots and zero all that is kept of them; how many. Raises BadShape, BadSchema, NoBot.
@@ -208,25 +250,45 @@ class Bots:
         self._slots.release(slots_N)
         return int(slots_N.size)
 
-    def _ask(
+    def _request(self, company: Company, *said: Any) -> Request:
+        return Request.checked(self._checks, self._spending, company, *said)
+
+    def _left(self, company: Company, request: Request, rewards: Numbers, replayed: Numbers) -> tuple[_Floats, _Floats]:
+        """What each bot has left in a turn, [N], and what the message says of that: [N], empty where nothing."""
+        if replayed is None:
+            return self._contexts.returns_to_go(company.batch) - request.rewards_N, np.zeros(0)
+        if rewards is not None:
+            raise BadSchema("rewards came with replayed_returns_to_go, which has counted them")
+        limit = MAX_RETURN_TO_GO
+        replayed_N = inputs.per_bot("replayed_returns_to_go", replayed, company.n_bots, -limit, limit)
+        return replayed_N, replayed_N
+
+    def _answer(
         self,
-        company: Company,
-        frame: int,
-        request: tuple[NDArray[Any], ...],
-        returns_to_go_N: NDArray[np.float64],
-        means: Means,
-        frame_budget_us: float | None,
-    ) -> Turn:
-        """Compute a turn's first half without changing any bot."""
-        batch, n_queries = company.batch, self.bundle.manifest.features.n_queries
-        batch.begin(request[0], returns_to_go_N, means.terms.target_cost_N)
-        noise_NX = self._contexts.noise(batch)
-        drawn = draw(self._policy, batch, noise_NX, means, frame_budget_us, self._clock)
-        for array in (drawn.query_NM, drawn.cost_us_N, drawn.probs_NM):
-            array.flags.writeable = False
-        queries = Queries(frame, drawn.query_NM, drawn.cost_us_N, drawn.probs_NM, drawn.infer_us)
-        budget_us = means.budget_us if frame_budget_us is None else min(means.budget_us, frame_budget_us)
-        return Turn(frame, company.handles_N, request, queries, noise_NX[:, n_queries:], drawn.asks_N, budget_us)
+        turn: Turn,
+        batch: Batch,
+        acquired_NM: NDArray[np.bool_],
+        known_NM: NDArray[np.bool_],
+        measured_us: _Floats,
+        costs: Costs | None,
+    ) -> Actions:
+        """Act on what was staged as acquired and is known, and learn what acquiring cost."""
+        np.copyto(batch.query_NM, known_NM)
+        actions = self._step.act(self._policy, turn, batch)
+        turn.actions, turn.measured_us = actions, measured_us
+        batch.keep_acquired()
+        if measured_us.size and costs is not None:
+            acquire_us = float(measured_us[0])
+            predicted_us = costs.observe(acquired_NM, acquire_us)
+            if predicted_us is not None:
+                self.spent.measure(acquire_us, predicted_us, turn.budget_us)
+        return actions
+
+
+def _measured(acquire_us: float | None) -> _Floats:
+    """[1], or empty where nothing was measured. Raises NonFinite, OutOfRange."""
+    measured = () if acquire_us is None else (acquire_us,)
+    return inputs.per_bot("acquire_us", measured, len(measured), 0.0, MAX_ACQUIRE_US)
 
 
 def _check_same(content: tuple[NDArray[np.generic], ...], kept: tuple[NDArray[np.generic], ...], frame: int) -> None:

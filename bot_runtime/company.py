@@ -17,6 +17,7 @@ from bot_runtime.budget import allocate
 from bot_runtime.context import Contexts
 from bot_runtime.slots import Slots
 from bot_runtime.spending import Limits, Spending, Terms
+from protocol.errors import OverBudget
 
 if TYPE_CHECKING:  # a turn is a company's, and a company remembers its last turn
     from bot_runtime.turns import Turn
@@ -61,7 +62,7 @@ class Means:
         Most frames need no allocation; without a shared budget no other bots than those that sampled too much do.
         """
         costs_NM, calls_N, budgets_N = self.terms[:3]
-        query_NM, cost_us_N = sampled_NM, self._cost_us(sampled_NM)
+        query_NM, cost_us_N = sampled_NM, self.cost_us(sampled_NM)
         fits_N = cost_us_N <= self.ample_N
         if frame_budget_us is None:
             rows = np.flatnonzero(~fits_N)
@@ -71,9 +72,21 @@ class Means:
             query_NM[rows] = allocate(probs_NM[rows], sampled_NM[rows], *rest)
         elif not (fits_N.all() and cost_us_N.sum() <= frame_budget_us * _AMPLE):
             query_NM = allocate(probs_NM, sampled_NM, costs_NM, calls_N, budgets_N, frame_budget_us)
-        return query_NM, self._cost_us(query_NM)
+        return query_NM, self.cost_us(query_NM)
 
-    def _cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
+    def check(self, cost_us_N: _Floats, frame_budget_us: float | None) -> None:
+        """Raises OverBudget unless queries of these costs, [N], fit."""
+        budgets_N = self.terms.budgets_N
+        if not (cost_us_N <= budgets_N).all():
+            row = int(np.argmax(cost_us_N > budgets_N))
+            said = f"the query of bot {row} of the message costs {cost_us_N[row]:g} µs"
+            raise OverBudget(f"{said}, expected at most its budget of {budgets_N[row]:g} µs")
+        if frame_budget_us is not None and cost_us_N.sum() > frame_budget_us:
+            said = f"the message's queries cost {cost_us_N.sum():g} µs"
+            raise OverBudget(f"{said}, expected at most the frame's budget of {frame_budget_us:g} µs")
+
+    def cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
+        """What a query costs, predicted µs, [N]."""
         cost_us_N: _Floats = np.add.reduce(np.multiply(self.terms.costs_NM, query_NM, out=self.room_NM), axis=1)
         if self.calls_cost:
             cost_us_N += np.where(query_NM.any(axis=1), self.terms.calls_N, 0.0)

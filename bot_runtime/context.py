@@ -44,10 +44,25 @@ class Contexts:
         noise = Noise(self._seeds_B[slots_N], count)
         return Batch(self._manifest, self._rows, self._copies, self._outputs, slots_N, noise)
 
-    def begin(self, slots_N: _Ints, seeds_N: NDArray[np.uint64], target_returns_N: NDArray[np.float64]) -> None:
-        """Give zeroed rows to new bots: an empty context, their seeds, and their target returns to go."""
+    def begin(
+        self,
+        slots_N: _Ints,
+        seeds_N: NDArray[np.uint64],
+        target_returns_N: NDArray[np.float64],
+        turns_N: _Ints | None = None,
+    ) -> None:
+        """Give zeroed rows to new bots: an empty context, their seeds, and their target returns to go.
+
+        Where `turns_N` is given, so many turns are over. They count for the noise, and for where the ring goes on: it
+        is all zeros, and once turns of before have gone over it, the context is theirs to the bit.
+        """
         self._seeds_B[slots_N] = seeds_N
         self._returns_to_go_B[slots_N] = target_returns_N
+        if turns_N is not None:
+            self._turns_B[slots_N] = turns_N
+            if self._n_slots:
+                around_N = self._n_slots + turns_N % self._n_slots
+                self._rows.place[slots_N] = np.where(turns_N < self._n_slots, turns_N, around_N)
 
     def clear(self, slots_N: _Ints) -> None:
         """Zero every number of these rows, so that nothing of a stopped bot reaches the next one."""
@@ -58,6 +73,10 @@ class Contexts:
     def turns(self, batch: Batch) -> _Ints:
         """How many turns each context took, shape [N]."""
         return self._turns_B[batch.at]
+
+    def hidden(self, batch: Batch) -> _Floats:
+        """Each bot's hidden state after its last turn, a copy, shape [N, W]."""
+        return self._rows.before[batch.at, : self._manifest.width].copy()
 
     def returns_to_go(self, batch: Batch) -> NDArray[np.float64]:
         """What is left of each bot's target return, shape [N]."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bot_runtime.batch import Batch
 from bot_runtime.company import Means
 
-__all__ = ["Asker", "Draw", "asking", "draw", "timed_us"]
+__all__ = ["Asker", "Draw", "draw", "finite_rows", "timed_us"]
 
 
 class Asker(Protocol):
@@ -50,14 +50,14 @@ def draw(
     infer_us = timed_us(clock, asker.query_probs, batch)
     probs_NM = batch.probs_NM.copy()
     query_NM = noise_NX[:, : probs_NM.shape[1]] < probs_NM
-    asks_N = asking(probs_NM)
+    asks_N = finite_rows(probs_NM)
     if asks_N is not None:
         query_NM &= asks_N[:, None]
     query_NM, cost_us_N = means.fit(probs_NM, query_NM, frame_budget_us)
     return Draw(query_NM, cost_us_N, probs_NM, asks_N, infer_us)
 
 
-def asking(probs_NM: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+def finite_rows(probs_NM: NDArray[np.float32]) -> NDArray[np.bool_] | None:
     """Whose means are finite, [N]; None where everyone's are."""
     finite_NM = np.isfinite(probs_NM)
     if np.count_nonzero(finite_NM) == finite_NM.size:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from protocol.errors import BadShape, MissingFeature, NonFinite, OutOfRange, UnrequestedFeature
 from protocol.features import CostModel, Feature, FeatureTable
+from protocol.messages import MAX_FRAME
 from protocol.values import check_shape, check_values
 
-__all__ = ["FeatureChecks", "check_costs", "per_bot", "seeds"]
+__all__ = ["FeatureChecks", "check_costs", "per_bot", "seeds", "turns"]
 
 _MAX_SEED = 2**64 - 1
 
@@ -57,6 +58,16 @@ def seeds(numbers: Sequence[int] | NDArray[np.integer], n_bots: int) -> NDArray[
     return np.array([int(seed) for seed in numbers], dtype=np.uint64)
 
 
+def turns(numbers: Sequence[int] | NDArray[np.integer], n_bots: int) -> NDArray[np.int64]:
+    """How many turns each bot has taken, shape [N]. Raises BadShape, OutOfRange (outside 0 to `MAX_FRAME`)."""
+    if len(numbers) != n_bots:
+        raise BadShape(f"turns has {len(numbers)} numbers, expected {n_bots}, one a bot")
+    for row, taken in enumerate(numbers):
+        if not 0 <= taken <= MAX_FRAME:
+            raise OutOfRange(f"turns of bot {row} of the message are {taken}, expected 0 to {MAX_FRAME}")
+    return np.array([int(taken) for taken in numbers], dtype=np.int64)
+
+
 class FeatureChecks:
     """The checks of one feature table for up to `capacity` bots, with room for what they compute on the way."""
 
@@ -74,6 +85,16 @@ class FeatureChecks:
         check_shape("free", free_NF, (handles_N.size, self._table.n_free), np.float32)
         if not self._within(free_NF, self._free_range):
             check_values(free_NF, None, handles_N, self._table.free, self._free_range)
+
+    def query(self, acquired_NM: _Bools, failed_NM: _Bools | None, handles_N: NDArray[np.int64]) -> _Bools:
+        """What an engine that decides for itself asked for: what it acquired or failed, [N, M]. Raises BadShape."""
+        shape = handles_N.size, self._table.n_queries
+        check_shape("acquired", acquired_NM, shape, np.bool_)
+        if failed_NM is None:
+            return acquired_NM.copy()
+        check_shape("failed", failed_NM, shape, np.bool_)
+        asked_NM: _Bools = acquired_NM | failed_NM
+        return asked_NM
 
     def costly(
         self,

@@ -101,6 +101,14 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.context_length - 1
 
     @property
+    def replay_turns(self) -> int:
+        """How many of a bot's last turns rebuild its context to the bit: with span K and L layers, L (K - 1) + 1.
+
+        A layer's keys and values at turn t are felt for K - 1 turns by the next layer; one turn is the last action's.
+        """
+        return self.n_layers * self.n_slots + 1
+
+    @property
     def has_context(self) -> bool:
         """Whether the network remembers earlier frames: it then has a hidden state, keys and values."""
         return self.context_length > 1

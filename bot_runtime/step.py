@@ -45,7 +45,7 @@ class Step:
             action_NA, reasons_N = self._fall_back(turn, batch, action_NA)
             self._counters.count(reasons_N)
         action_NA.flags.writeable = reasons_N.flags.writeable = False
-        return Actions(turn.frame, action_NA, reasons_N, infer_us)
+        return Actions(turn.frame, action_NA, reasons_N, infer_us, self._contexts.turns(batch).copy())
 
     def _fall_back(
         self, turn: Turn, batch: Batch, learned_NA: NDArray[np.float32]

@@ -35,12 +35,13 @@ class Queries(NamedTuple):
 
 
 class Actions(NamedTuple):
-    """What each bot does, why (`bot_runtime.fallback.Reason`), and µs of inference."""
+    """What each bot does, why (`bot_runtime.fallback.Reason`), µs of inference, and how many turns its context took."""
 
     frame: int
     action_NA: NDArray[np.float32]
     reasons_N: NDArray[np.uint8]
     infer_us: float
+    turns_N: _Ints
 
 
 @dataclass
@@ -58,6 +59,7 @@ class Turn:
     measured_us: NDArray[np.float64] = field(
         default_factory=lambda: np.zeros(0)
     )  # what acquiring took, [1], where the engine says so
+    taken: bool = False  # both halves came at once, in a `take_turn`
     key: int = _NONE  # in `Turns`
     members: int = 0  # how many of its bots have begun no other turn since, and are still there
 
@@ -76,27 +78,30 @@ class Turns:
         self._next_key = _NONE + 1
         self._counters = counters
 
-    def query(self, company: Company, frame: int) -> Turn | None:
-        """The turn that this request repeats, or None when it is a new one; changes nothing.
+    def begun(self, company: Company, frame: int, event: Event) -> Turn | None:
+        """The turn that this `event`, which begins one, repeats, or None when it is a new one; changes nothing.
 
-        Raises StaleFrame; FrameReused when any of these bots saw this frame in other company.
+        Raises StaleFrame; FrameReused when any of these bots saw this frame in other company, or began it otherwise.
         """
         repeats, turns = False, self._last(company)
         for turn in turns:
             phase, last_frame = (turn.phase, turn.frame) if turn else (Phase.IDLE, None)
-            transition(phase, last_frame, Event.QUERY, frame)
-            repeats |= is_retry(phase, last_frame, Event.QUERY, frame)
+            transition(phase, last_frame, event, frame)
+            repeats |= is_retry(phase, last_frame, event, frame)
         if not repeats:
             return None
         turn = self._turns.get(int(self._turn_of_B[company.slots_N[0]]))
         if turn is None or not _are_its_bots(company, turn):
             raise FrameReused(f"frame {frame} was requested before with other bots, or in another order")
+        if turn.taken is not (event is Event.TURN):
+            raise FrameReused(f"frame {frame} came before by another message than {event.value}")
         return turn
 
     def features(self, company: Company, frame: int) -> Turn:
         """The turn that these features answer (again, if its actions are known); changes nothing.
 
-        Raises StaleFrame and NoPendingQuery, the latter also unless the bots are exactly the query's, in its order.
+        Raises StaleFrame and NoPendingQuery, the latter also unless the bots are exactly the query's, in its order;
+        FrameReused where the turn was taken in one message.
         """
         turns = self._last(company)
         for turn in turns:
@@ -105,6 +110,8 @@ class Turns:
         turn = turns[0]
         if turn is None or len(turns) > 1 or not _are_its_bots(company, turn):
             raise NoPendingQuery(f"no query of frame {frame} is pending for exactly these bots in this order")
+        if turn.taken:
+            raise FrameReused(f"frame {frame} came before by {Event.TURN.value}")
         return turn
 
     def begin(self, company: Company, turn: Turn) -> None:

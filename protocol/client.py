@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from protocol.errors import BadShape, NoConnection, ProtocolError
-from protocol.features import CostModel
+from protocol.features import CostModel, FeatureTable
 from protocol.replies import (
     Actions,
     Queries,
@@ -85,14 +85,20 @@ class BotClient:
         target_returns: Sequence[float] | None = None,
         budgets_us: Sequence[float] | None = None,
         target_costs_us: Sequence[float] | None = None,
+        turns: Sequence[int] | None = None,
     ) -> NDArray[np.int64]:
-        """Start bots; each sequence, where given, has one entry a bot. Returns their handles, int64 [count]."""
+        """Start bots; each sequence, where given, has one entry a bot. Returns their handles, int64 [count].
+
+        `turns` are those that they took before, at a server that is gone: see `protocol.resuming`.
+        """
         message: dict[str, Any] = {"type": "start_bots", "count": int(count)}
         if seeds is not None:
             message["seeds"] = [int(seed) for seed in seeds]
         _add_numbers(message, "target_returns", target_returns)
         _add_numbers(message, "budgets_us", budgets_us)
         _add_numbers(message, "target_costs_us", target_costs_us)
+        if turns is not None:
+            message["turns"] = [int(taken) for taken in turns]
         handles_N, self._welcome = read_bots_started(self.exchange(message), self.welcome)
         return handles_N
 
@@ -111,13 +117,11 @@ class BotClient:
         `frame_budget_us` is shared by all these bots, on top of each bot's own budget. `budgets_us` and
         `target_costs_us` [N] replace those of the bots' start for this frame only. Raises BadShape locally too.
         """
-        table = self.welcome.features
-        handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
-        free_NF = _matrix(free, "<f4", (len(handles), table.n_free), "free")
-        message = {"type": "request_queries", "frame": int(frame), "bots": handles, "free": free_NF.tobytes()}
+        table, handles = self.welcome.features, _handles(bots)
+        message = {"type": "request_queries", "frame": int(frame), "bots": handles}
+        message["free"] = _matrix(free, "<f4", (len(handles), table.n_free), "free").tobytes()
         _add_numbers(message, "rewards", rewards)
-        if frame_budget_us is not None:
-            message["frame_budget_us"] = float(frame_budget_us)
+        _add_number(message, "frame_budget_us", frame_budget_us)
         _add_numbers(message, "budgets_us", budgets_us)
         _add_numbers(message, "target_costs_us", target_costs_us)
         return read_queries(self._framed(message), len(handles), table)
@@ -130,31 +134,61 @@ class BotClient:
         costly: ArrayLike,
         failed: ArrayLike | None = None,
         acquire_us: float | None = None,
+        hidden: bool = False,
     ) -> Actions:
         """Answer the pending query of the same bots and frame, and get their actions.
 
         `acquired` and `failed` are bool [N, M], together exactly what was asked for; `costly` is [N, D], of which only
         the acquired numbers are read and sent. `acquire_us` is what acquiring all of this took: the server then keeps
-        budgets by what it measures, if its welcome has a `cost_quantile`. Raises BadShape locally too.
+        budgets by what it measures, if its welcome has a `cost_quantile`. `hidden` asks for the hidden state, which a
+        head in the engine reads. Raises BadShape locally too.
         """
-        welcome = self.welcome
-        table = welcome.features
-        handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
-        acquired_NM = _matrix(acquired, "?", (len(handles), table.n_queries), "acquired")
-        costly_ND = _matrix(costly, "<f4", (len(handles), table.n_costly), "costly")
+        welcome, handles = self.welcome, _handles(bots)
         message = {"type": "submit_features", "frame": int(frame), "bots": handles}
-        message["acquired"] = _pack_bits(acquired_NM)
-        message["values"] = costly_ND[np.repeat(acquired_NM, table.sizes, axis=1)].tobytes()
-        if failed is not None:
-            message["failed"] = _pack_bits(_matrix(failed, "?", acquired_NM.shape, "failed"))
-        if acquire_us is not None:
-            message["acquire_us"] = float(acquire_us)
+        _add_acquired(message, welcome.features, len(handles), acquired, costly, failed)
+        _add_number(message, "acquire_us", acquire_us)
+        if hidden:
+            message["hidden"] = True
+        return read_actions(self._framed(message), len(handles), welcome.action)
+
+    def take(
+        self,
+        bots: ArrayLike,
+        frame: int,
+        free: ArrayLike,
+        acquired: ArrayLike,
+        costly: ArrayLike,
+        rewards: ArrayLike | None = None,
+        failed: ArrayLike | None = None,
+        acquire_us: float | None = None,
+        frame_budget_us: float | None = None,
+        budgets_us: ArrayLike | None = None,
+        target_costs_us: ArrayLike | None = None,
+        hidden: bool = True,
+        replayed_returns_to_go: ArrayLike | None = None,
+    ) -> Actions:
+        """A whole turn in one round trip, where the engine has decided what to acquire; arguments as in both halves.
+
+        `bot_runtime.head.Head` decides as the server would. A server knows this whose welcome has `replay_frames`.
+        Raises OverBudget where what was acquired or failed costs more than a budget; BadShape locally too.
+        """
+        welcome, handles = self.welcome, _handles(bots)
+        table, message = welcome.features, {"type": "take_turn", "frame": int(frame), "bots": handles}
+        message["free"] = _matrix(free, "<f4", (len(handles), table.n_free), "free").tobytes()
+        _add_acquired(message, table, len(handles), acquired, costly, failed)
+        _add_numbers(message, "rewards", rewards)
+        _add_number(message, "acquire_us", acquire_us)
+        _add_number(message, "frame_budget_us", frame_budget_us)
+        _add_numbers(message, "budgets_us", budgets_us)
+        _add_numbers(message, "target_costs_us", target_costs_us)
+        if hidden:
+            message["hidden"] = True
+        _add_numbers(message, "replayed_returns_to_go", replayed_returns_to_go)
         return read_actions(self._framed(message), len(handles), welcome.action)
 
     def stop(self, bots: ArrayLike) -> int:
         """End these bots; returns how many ended."""
-        handles = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
-        return int(self.exchange({"type": "stop_bots", "bots": handles})["count"])
+        return int(self.exchange({"type": "stop_bots", "bots": _handles(bots)})["count"])
 
     def close(self) -> None:
         """End the connection and its bots, and close the socket. A server that is gone already is no error."""
@@ -183,6 +217,32 @@ class BotClient:
 
 def _cost_model_dict(cost_model: CostModel) -> dict[str, Any]:
     return {"call_us": float(cost_model.call_us), "feature_us": [float(us) for us in cost_model.feature_us]}
+
+
+def _handles(bots: ArrayLike) -> list[int]:
+    handles: list[int] = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
+    return handles
+
+
+def _add_acquired(
+    message: dict[str, Any],
+    table: FeatureTable,
+    n_bots: int,
+    acquired: ArrayLike,
+    costly: ArrayLike,
+    failed: ArrayLike | None,
+) -> None:
+    acquired_NM = _matrix(acquired, "?", (n_bots, table.n_queries), "acquired")
+    costly_ND = _matrix(costly, "<f4", (n_bots, table.n_costly), "costly")
+    message["acquired"] = _pack_bits(acquired_NM)
+    message["values"] = costly_ND[np.repeat(acquired_NM, table.sizes, axis=1)].tobytes()
+    if failed is not None:
+        message["failed"] = _pack_bits(_matrix(failed, "?", acquired_NM.shape, "failed"))
+
+
+def _add_number(message: dict[str, Any], name: str, value: float | None) -> None:
+    if value is not None:
+        message[name] = float(value)
 
 
 def _add_numbers(message: dict[str, Any], name: str, values: ArrayLike | None) -> None:

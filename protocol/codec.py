@@ -43,12 +43,11 @@ _NUMBER_BYTES = {Format.MSGPACK: 9, Format.JSON: 26}  # a double at its widest, 
 def body_limit(table: FeatureTable, max_bots: int, form: Format) -> int:
     """Bytes of the largest message that can make sense: `max_bots` bots of this table, in lists of the widest numbers.
 
-    A bot has at most F + 3 numbers in a request, D numbers and 2 M bits in a submission, and 4 numbers in a start.
+    A bot has at most F + 4 numbers, D numbers and 2 M bits in a whole turn, and 5 numbers in a start.
     """
     number_bytes = _NUMBER_BYTES[form]
-    per_request = number_bytes * (table.n_free + 3)
-    per_submission = number_bytes * table.n_costly + 2 * _BIT_BYTES * table.n_queries
-    per_bot = _HANDLE_BYTES + 16 + max(per_request, per_submission, 4 * number_bytes)
+    per_turn = number_bytes * (table.n_free + table.n_costly + 4) + 2 * _BIT_BYTES * table.n_queries
+    per_bot = _HANDLE_BYTES + 16 + max(per_turn, 5 * number_bytes)
     return _FIXED_BYTES + number_bytes * table.n_queries + per_bot * max_bots
 
 

@@ -27,6 +27,7 @@ __all__ = [
     "NonFinite",
     "NotReady",
     "OutOfRange",
+    "OverBudget",
     "ProtocolError",
     "StaleFrame",
     "TooDeep",
@@ -160,6 +161,12 @@ class OutOfRange(ProtocolError):
     """A number lies outside the range that its feature declares."""
 
     code, status = "OUT_OF_RANGE", 422
+
+
+class OverBudget(ProtocolError):
+    """What the engine acquired on its own decision costs more than a budget, by the costs that count."""
+
+    code, status = "OVER_BUDGET", 422
 
 
 class UnrequestedFeature(ProtocolError):

@@ -16,6 +16,7 @@ __all__ = [
     "MAX_BOTS_PER_MESSAGE",
     "MAX_FRAME",
     "MAX_RETURN",
+    "MAX_RETURN_TO_GO",
     "PROTOCOL_VERSION",
     "Actions",
     "Bits",
@@ -33,6 +34,7 @@ __all__ = [
     "StartBots",
     "StopBots",
     "SubmitFeatures",
+    "TakeTurn",
     "Welcome",
 ]
 
@@ -40,6 +42,7 @@ PROTOCOL_VERSION = 1
 MAX_BOTS_PER_MESSAGE = 65536
 MAX_FRAME = 2**53  # the largest count that a JSON number or a double holds exactly
 MAX_RETURN = 1e9  # of one reward or target return: float32 holds sums of very many
+MAX_RETURN_TO_GO = 1e30  # what no sum of them reaches, and float32 holds
 
 Blob = bytes | Annotated[list[list[float]], Meta(max_length=MAX_BOTS_PER_MESSAGE)]
 """float32 [N, n]: little-endian row-major bytes in msgpack, nested lists in JSON."""
@@ -51,6 +54,7 @@ _Count = Annotated[int, Meta(ge=1, le=MAX_BOTS_PER_MESSAGE)]
 _Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _Handle = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _Handles = Annotated[list[_Handle], Meta(min_length=1, max_length=MAX_BOTS_PER_MESSAGE)]
+_Turns = Annotated[list[_Frame], Meta(max_length=MAX_BOTS_PER_MESSAGE)]
 _PerBot = Annotated[list[float], Meta(max_length=MAX_BOTS_PER_MESSAGE)]
 _Token = Annotated[str, Meta(max_length=1024)]
 _BundleName = Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9_-]{0,63}(@[1-9][0-9]{0,8})?$", max_length=74)]
@@ -80,6 +84,8 @@ class Welcome(_Message, frozen=True, tag="welcome"):
     `cost_quantile` is how often acquiring is to take no longer than predicted, once it is measured; null where a
     server takes no measurements. `bundle_version` is null where the server has no store of versions; `bundle_sha256` is
     of the bundle's manifest, which has the hashes of its other files.
+    `replay_frames` is how many of a bot's last turns rebuild its context, `target_return` a bot's target return unless
+    told otherwise; null from a server that knows no `take_turn`.
     """
 
     connection: str
@@ -95,16 +101,22 @@ class Welcome(_Message, frozen=True, tag="welcome"):
     cost_quantile: float | None = None
     bundle_version: _Version | None = None
     bundle_sha256: str | None = None
+    replay_frames: int | None = None
+    target_return: float | None = None
 
 
 class StartBots(_Message, frozen=True, tag="start_bots"):
-    """Start `count` bots; each list, where given, has one entry a bot."""
+    """Start `count` bots; each list, where given, has one entry a bot.
+
+    `turns` are those that a bot took before, at a server that is gone: it goes on with the next one's noise.
+    """
 
     count: _Count
     seeds: Annotated[list[_Seed], Meta(max_length=MAX_BOTS_PER_MESSAGE)] | None = None
     target_returns: _PerBot | None = None
     budgets_us: _PerBot | None = None
     target_costs_us: _PerBot | None = None
+    turns: _Turns | None = None
 
 
 class BotsStarted(_Message, frozen=True, tag="bots_started"):
@@ -145,7 +157,7 @@ class SubmitFeatures(_Message, frozen=True, tag="submit_features"):
 
     `acquired` and `failed` are bits [N, M]. `values` is ragged: for each bot in order, for each acquired feature in
     order, its `size` numbers (float32 little-endian bytes, or one list a bot). `acquire_us` is what acquiring all of
-    this took, as the engine measured it.
+    this took, as the engine measured it. `hidden` asks for each bot's hidden state in the reply.
     """
 
     frame: _Frame
@@ -154,15 +166,44 @@ class SubmitFeatures(_Message, frozen=True, tag="submit_features"):
     values: Blob
     failed: Bits | None = None
     acquire_us: float | None = None
+    hidden: bool = False
+
+
+class TakeTurn(_Message, frozen=True, tag="take_turn"):
+    """A whole turn in one message, where the engine has decided what to acquire: the fields of both halves.
+
+    What was acquired or failed is the query, and must fit the budgets. `replayed_returns_to_go` [N] says that the turn
+    was taken before, at a server that is gone, and what each bot had left in it, its rewards counted: no budget is
+    checked, and what the bot itself has left stays.
+    """
+
+    frame: _Frame
+    bots: _Handles
+    free: Blob
+    acquired: Bits
+    values: Blob
+    rewards: _PerBot | None = None
+    failed: Bits | None = None
+    acquire_us: float | None = None
+    frame_budget_us: float | None = None
+    budgets_us: _PerBot | None = None
+    target_costs_us: _PerBot | None = None
+    hidden: bool = False
+    replayed_returns_to_go: _PerBot | None = None
 
 
 class Actions(_Message, frozen=True, tag="actions"):
-    """The actions [N, A]; why each bot got its action (0 = learned) [N]; the time spent deciding, in µs."""
+    """The actions [N, A]; why each bot got its action (0 = learned) [N]; the time spent deciding, in µs.
+
+    `turns` [N] says how many turns each bot's context has taken; `hidden` [N, W] is its state after them, if asked for.
+    """
 
     frame: _Frame
     actions: Blob
     reasons: list[int]
     infer_us: float
+    turns: list[int] | None = None
+    hidden: Blob | None = None
 
 
 class StopBots(_Message, frozen=True, tag="stop_bots"):
@@ -193,5 +234,5 @@ class Error(_Message, frozen=True, tag="error"):
     retry_after_s: float | None = None
 
 
-Request = Hello | StartBots | RequestQueries | SubmitFeatures | StopBots | Goodbye
+Request = Hello | StartBots | RequestQueries | SubmitFeatures | TakeTurn | StopBots | Goodbye
 Reply = Welcome | BotsStarted | Queries | Actions | BotsStopped | Farewell | Error

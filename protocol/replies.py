@@ -35,6 +35,7 @@ _REPLY_TO = {
     "start_bots": "bots_started",
     "request_queries": "queries",
     "submit_features": "actions",
+    "take_turn": "actions",
     "stop_bots": "bots_stopped",
     "goodbye": "farewell",
 }
@@ -45,7 +46,8 @@ class Welcome(NamedTuple):
 
     `target_cost_us` is None where the bundle is not conditioned on its budget, and `cost_quantile` where the server
     takes no measurements; both from a server that is older than the field. `bundle_version` is None where the server
-    keeps no versions; `bundle_sha256`, the hash of the manifest, only from an older server.
+    keeps no versions; `bundle_sha256`, the hash of the manifest, only from an older server, as are `replay_frames` and
+    `target_return`.
     """
 
     connection: str
@@ -61,6 +63,8 @@ class Welcome(NamedTuple):
     cost_quantile: float | None = None
     bundle_version: int | None = None
     bundle_sha256: str | None = None
+    replay_frames: int | None = None
+    target_return: float | None = None
 
 
 class Queries(NamedTuple):
@@ -73,12 +77,17 @@ class Queries(NamedTuple):
 
 
 class Actions(NamedTuple):
-    """What to do: `actions` float32 [N, A]; `reasons` uint8 [N], 0 = learned; `infer_us` spent."""
+    """What to do: `actions` float32 [N, A]; `reasons` uint8 [N], 0 = learned; `infer_us` spent.
+
+    `turns` int64 [N] is how many each context took, None from an older server; `hidden` float32 [N, W] if asked for.
+    """
 
     frame: int
     actions: NDArray[np.float32]
     reasons: NDArray[np.uint8]
     infer_us: float
+    turns: NDArray[np.int64] | None = None
+    hidden: NDArray[np.float32] | None = None
 
 
 def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
@@ -135,7 +144,10 @@ def read_actions(reply: dict[str, Any], bots: int, action: ActionSpec) -> Action
     with _reading("submit_features"):
         actions_NA = np.frombuffer(reply["actions"], dtype="<f4").reshape(bots, action.size)
         reasons_N = np.array(reply["reasons"], dtype=np.uint8).reshape(bots)
-        return Actions(int(reply["frame"]), actions_NA, reasons_N, float(reply["infer_us"]))
+        turns, hidden = reply.get("turns"), reply.get("hidden")
+        turns_N = None if turns is None else np.array(turns, dtype=np.int64).reshape(bots)
+        hidden_NW = None if hidden is None else np.frombuffer(hidden, dtype="<f4").reshape(bots, -1)
+        return Actions(int(reply["frame"]), actions_NA, reasons_N, float(reply["infer_us"]), turns_N, hidden_NW)
 
 
 def _read_version(reply: dict[str, Any]) -> dict[str, Any]:

@@ -21,10 +21,15 @@ ROUTES = {
     "start_bots": "/v1/bots/start",
     "request_queries": "/v1/query",
     "submit_features": "/v1/act",
+    "take_turn": "/v1/turn",
     "stop_bots": "/v1/bots/stop",
     "goodbye": "/v1/connections/close",
 }
-_REPEATABLE = {"request_queries", "submit_features"}  # a turn's retry gets the same answer and changes nothing
+_REPEATABLE = {
+    "request_queries",
+    "submit_features",
+    "take_turn",
+}  # a turn's retry gets the same answer and changes nothing
 _CONTENT_TYPE = "application/msgpack"
 
 

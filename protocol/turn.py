@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from protocol.errors import NoPendingQuery, ProtocolError, StaleFrame
+from protocol.errors import FrameReused, NoPendingQuery, ProtocolError, StaleFrame
 
 __all__ = ["TRANSITIONS", "Event", "Order", "Phase", "diagram", "is_retry", "transition"]
 
@@ -27,6 +27,7 @@ class Event(Enum):
 
     QUERY = "request_queries"
     FEATURES = "submit_features"
+    TURN = "take_turn"  # both at once
 
 
 class Order(Enum):
@@ -44,6 +45,9 @@ TRANSITIONS: dict[tuple[Phase, Event, Order], Phase | type[ProtocolError]] = {
     (Phase.IDLE, Event.FEATURES, Order.NEWER): NoPendingQuery,
     (Phase.IDLE, Event.FEATURES, Order.SAME): NoPendingQuery,
     (Phase.IDLE, Event.FEATURES, Order.OLDER): NoPendingQuery,
+    (Phase.IDLE, Event.TURN, Order.NEWER): Phase.ANSWERED,
+    (Phase.IDLE, Event.TURN, Order.SAME): StaleFrame,
+    (Phase.IDLE, Event.TURN, Order.OLDER): StaleFrame,
     # A newer frame abandons the pending query: engines may skip a turn, and the context does not advance.
     (Phase.PENDING, Event.QUERY, Order.NEWER): Phase.PENDING,
     (Phase.PENDING, Event.QUERY, Order.SAME): Phase.PENDING,
@@ -51,19 +55,26 @@ TRANSITIONS: dict[tuple[Phase, Event, Order], Phase | type[ProtocolError]] = {
     (Phase.PENDING, Event.FEATURES, Order.NEWER): NoPendingQuery,
     (Phase.PENDING, Event.FEATURES, Order.SAME): Phase.ANSWERED,
     (Phase.PENDING, Event.FEATURES, Order.OLDER): StaleFrame,
+    (Phase.PENDING, Event.TURN, Order.NEWER): Phase.ANSWERED,
+    (Phase.PENDING, Event.TURN, Order.SAME): FrameReused,
+    (Phase.PENDING, Event.TURN, Order.OLDER): StaleFrame,
     (Phase.ANSWERED, Event.QUERY, Order.NEWER): Phase.PENDING,
     (Phase.ANSWERED, Event.QUERY, Order.SAME): Phase.ANSWERED,
     (Phase.ANSWERED, Event.QUERY, Order.OLDER): StaleFrame,
     (Phase.ANSWERED, Event.FEATURES, Order.NEWER): NoPendingQuery,
     (Phase.ANSWERED, Event.FEATURES, Order.SAME): Phase.ANSWERED,
     (Phase.ANSWERED, Event.FEATURES, Order.OLDER): StaleFrame,
+    (Phase.ANSWERED, Event.TURN, Order.NEWER): Phase.ANSWERED,
+    (Phase.ANSWERED, Event.TURN, Order.SAME): Phase.ANSWERED,
+    (Phase.ANSWERED, Event.TURN, Order.OLDER): StaleFrame,
 }
 
 
 def transition(phase: Phase, last_frame: int | None, event: Event, frame: int) -> Phase:
     """The phase after `event` for `frame`, given the last frame that this bot saw (None before its first).
 
-    Raises StaleFrame or NoPendingQuery where the table says so; the caller's state is then to stay as it was.
+    Raises StaleFrame, NoPendingQuery or FrameReused where the table says so; the caller's state is then to stay as it
+    was.
     """
     outcome = TRANSITIONS[phase, event, _order(last_frame, frame)]
     if isinstance(outcome, Phase):

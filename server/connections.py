@@ -33,6 +33,11 @@ class Connection:
     is_pinned: bool = False
     bots: set[int] = field(default_factory=set)
 
+    @property
+    def measured_costs(self) -> Costs | None:
+        """None as long as nothing was measured: the costs are then those of the bots' start, which are at hand."""
+        return self.costs if self.costs.n_frames else None
+
     def check_owns(self, handles: Sequence[int]) -> None:
         """Raise NoBot for a bot that is not this connection's."""
         if not self.bots.issuperset(handles):

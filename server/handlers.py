@@ -9,7 +9,9 @@ from __future__ import annotations
 import hmac
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bot_runtime import turns
 from bot_runtime.costs import Report
 from bot_runtime.inputs import check_costs
 from protocol import arrays
@@ -31,6 +33,7 @@ from protocol.messages import (
     StartBots,
     StopBots,
     SubmitFeatures,
+    TakeTurn,
     Welcome,
 )
 from server.connections import Connection, Connections
@@ -68,6 +71,8 @@ class Handlers:
                 return self._request_queries(request, connection, form)
             case SubmitFeatures():
                 return self._submit_features(request, connection, form)
+            case TakeTurn():
+                return self._take_turn(request, connection, form)
             case StartBots():
                 return self._start_bots(request, connection)
             case StopBots():
@@ -123,6 +128,7 @@ class Handlers:
             budgets_us=request.budgets_us,
             target_costs_us=request.target_costs_us,
             cost_model=connection.costs.declared,
+            turns=request.turns,
         ).tolist()
         if serving is not connection.serving:
             self.servings.hold(serving)
@@ -150,8 +156,7 @@ class Handlers:
             request.frame_budget_us,
             request.budgets_us,
             request.target_costs_us,
-            # Nothing measured yet: the costs are those of the bots' start, which the runtime has at hand.
-            connection.costs if connection.costs.n_frames else None,
+            connection.measured_costs,
         )
         queries = arrays.pack_bits(turn.query_NM, form)
         return Queries(frame=turn.frame, queries=queries, cost_us=turn.cost_us_N.tolist(), infer_us=turn.infer_us)
@@ -167,8 +172,29 @@ class Handlers:
         turn = serving.bots.submit_features(
             handles_N, request.frame, acquired_NM, costly_ND, failed_NM, request.acquire_us, connection.costs
         )
-        actions = arrays.pack_floats(turn.action_NA, form)
-        return Actions(frame=turn.frame, actions=actions, reasons=turn.reasons_N.tolist(), infer_us=turn.infer_us)
+        return _actions(turn, serving.bots.hidden(handles_N) if request.hidden else None, form)
+
+    def _take_turn(self, request: TakeTurn, connection: Connection, form: Format) -> Actions:
+        connection.check_owns(request.bots)
+        serving, n_bots = connection.serving, len(request.bots)
+        acquired_NM = arrays.bits(request.acquired, (n_bots, serving.table.n_queries), "acquired")
+        handles_N = np.array(request.bots, dtype=np.int64)
+        turn = serving.bots.take_turn(
+            handles_N,
+            request.frame,
+            arrays.floats(request.free, (n_bots, serving.table.n_free), "free"),
+            acquired_NM,
+            arrays.unpack_values(request.values, acquired_NM, serving.table),
+            None if request.failed is None else arrays.bits(request.failed, acquired_NM.shape, "failed"),
+            request.rewards,
+            request.frame_budget_us,
+            request.budgets_us,
+            request.target_costs_us,
+            request.acquire_us,
+            connection.costs,
+            request.replayed_returns_to_go,
+        )
+        return _actions(turn, serving.bots.hidden(handles_N) if request.hidden else None, form)
 
     def _stop_bots(self, request: StopBots, connection: Connection) -> BotsStopped:
         connection.check_owns(request.bots)
@@ -183,3 +209,14 @@ class Handlers:
         """Stop what a connection that is gone has left."""
         self._stop(connection, list(connection.bots))
         self.servings.release(connection.serving)
+
+
+def _actions(turn: turns.Actions, hidden_NW: NDArray[np.float32] | None, form: Format) -> Actions:
+    return Actions(
+        frame=turn.frame,
+        actions=arrays.pack_floats(turn.action_NA, form),
+        reasons=turn.reasons_N.tolist(),
+        infer_us=turn.infer_us,
+        turns=turn.turns_N.tolist(),
+        hidden=None if hidden_NW is None else arrays.pack_floats(hidden_NW, form),
+    )

@@ -23,6 +23,7 @@ ROUTES: dict[str, tuple[type[messages.Request], type[messages.Reply]]] = {
     "/v1/bots/start": (messages.StartBots, messages.BotsStarted),
     "/v1/query": (messages.RequestQueries, messages.Queries),
     "/v1/act": (messages.SubmitFeatures, messages.Actions),
+    "/v1/turn": (messages.TakeTurn, messages.Actions),
     "/v1/bots/stop": (messages.StopBots, messages.BotsStopped),
     "/v1/connections/close": (messages.Goodbye, messages.Farewell),
 }

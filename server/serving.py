@@ -67,6 +67,8 @@ class Serving:
             cost_quantile=cost_quantile,
             bundle_version=self.version,
             bundle_sha256=self.sha256,
+            replay_frames=manifest.replay_turns,
+            target_return=manifest.target_return,
         )
 
     def keeps_promises_of(self, other: Serving) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 __all__ = ["write_vectors"]
 
-_FLOATS = {"free", "values", "actions"}
+_FLOATS = {"free", "values", "actions", "hidden"}
 _BITS = {"queries", "acquired", "failed"}
 _BOTS = [2**32, 2**32 + 1]
 
@@ -36,6 +36,15 @@ _FREE = [[1.5, -2.25, 1.0], [100.0, 0.0, 0.0]]
 _QUERIES = [[1, 0, 0, 0, 0, 0, 0, 0, 1, 1], [0, 1, 0, 0, 0, 0, 0, 0, 0, 0]]
 _SUBMIT = {"type": "submit_features", "frame": 7, "bots": _BOTS, "acquired": _QUERIES}
 
+_TURN = {
+    "type": "take_turn",
+    "frame": 7,
+    "bots": _BOTS,
+    "free": _FREE,
+    "acquired": _QUERIES,
+    "values": [[10.0, 1.0, 8.5, 9.5], [0.1]],
+}
+
 REQUESTS: dict[str, dict[str, Any]] = {
     "hello": {"type": "hello", "protocol": 1},
     "hello_cost_model_token": {"type": "hello", "protocol": 1, "cost_model": _COST_MODEL, "token": "s3cret é"},
@@ -49,6 +58,7 @@ REQUESTS: dict[str, dict[str, Any]] = {
         "budgets_us": [20.0, 0.0],
         "target_costs_us": [4.5, 0.0],
     },
+    "start_bots_turns": {"type": "start_bots", "count": 2, "seeds": [3, 4], "turns": [0, 2**53]},
     "request_queries": {"type": "request_queries", "frame": 0, "bots": _BOTS[:1], "free": _FREE[:1]},
     "request_queries_all": {
         "type": "request_queries",
@@ -68,6 +78,19 @@ REQUESTS: dict[str, dict[str, Any]] = {
         "failed": [[0, 0, 0, 0, 0, 0, 0, 0, 0, 1], [0, 1, 0, 0, 0, 0, 0, 0, 0, 0]],
     },
     "submit_features_measured": {**_SUBMIT, "values": [[10.0, 1.0, 8.5, 9.5], [0.1]], "acquire_us": 40.5},
+    "submit_features_hidden": {**_SUBMIT, "values": [[10.0, 1.0, 8.5, 9.5], [0.1]], "hidden": True},
+    "take_turn": _TURN,
+    "take_turn_all": {
+        **_TURN,
+        "failed": [[0] * 10, [0, 0, 1, 0, 0, 0, 0, 0, 0, 0]],
+        "rewards": [0.5, -1.0],
+        "acquire_us": 40.5,
+        "frame_budget_us": 42.5,
+        "budgets_us": [23.5, 19.0],
+        "target_costs_us": [0.25, 18.0],
+        "hidden": True,
+    },
+    "take_turn_replayed": {**_TURN, "replayed_returns_to_go": [99.5, 0.1]},
     "stop_bots": {"type": "stop_bots", "bots": _BOTS},
     "goodbye": {"type": "goodbye"},
 }
@@ -87,6 +110,8 @@ _WELCOME = {
     "target_cost_us": None,
     "cost_quantile": 0.998,
     **_SERVED,
+    "replay_frames": 58,
+    "target_return": 100.0,
 }
 REPLIES: dict[str, dict[str, Any]] = {
     "welcome": _WELCOME,
@@ -96,6 +121,7 @@ REPLIES: dict[str, dict[str, Any]] = {
         "target_cost_us": 6.8,
         "cost_quantile": None,
         **_NO_VERSION,
+        "replay_frames": 1,
     },
     "bots_started": {"type": "bots_started", "bots": _BOTS, **_SERVED},
     "queries": {"type": "queries", "frame": 7, "queries": _QUERIES, "cost_us": [23.5, 17.5], "infer_us": 80.25},
@@ -105,6 +131,17 @@ REPLIES: dict[str, dict[str, Any]] = {
         "actions": [[-0.5, 1.0], [0.25, 0.0]],
         "reasons": [0, 3],
         "infer_us": 120.0,
+        "turns": [8, 0],
+        "hidden": None,
+    },
+    "actions_hidden": {
+        "type": "actions",
+        "frame": 7,
+        "actions": [[-0.5, 1.0], [0.25, 0.0]],
+        "reasons": [0, 1],
+        "infer_us": 120.0,
+        "turns": [8, 300],
+        "hidden": [[1.5, -2.0, 0.25], [0.0, 8.0, -1.0]],
     },
     "bots_stopped": {"type": "bots_stopped", "count": 2},
     "farewell": {"type": "farewell"},
@@ -124,7 +161,7 @@ def write_vectors(folder: Path) -> None:
 
 def _refused() -> dict[str, tuple[str, bytes]]:
     """Requests that a server of the golden `welcome` refuses, with the code that it refuses them with."""
-    query, submit = REQUESTS["request_queries_all"], REQUESTS["submit_features"]
+    query, submit, turn = REQUESTS["request_queries_all"], REQUESTS["submit_features"], {**_TURN, "frame": 9}
     whole = _pack(query)
     return {
         "empty": ("BAD_MSGPACK", b""),
@@ -150,6 +187,8 @@ def _refused() -> dict[str, tuple[str, bytes]]:
         "out_of_range": ("OUT_OF_RANGE", _pack({**query, "free": [[100.5, 0.0, 0.0], _FREE[1]]})),
         "value_out_of_range": ("OUT_OF_RANGE", _pack({**submit, "values": [[10.0, -1.0, 8.5, 9.5], [0.1]]})),
         "nan_acquire_us": ("NON_FINITE", _pack({**submit, "acquire_us": float("nan")})),
+        "over_budget": ("OVER_BUDGET", _pack({**turn, "budgets_us": [1e9, 1.0]})),
+        "over_frame_budget": ("OVER_BUDGET", _pack({**turn, "frame_budget_us": 8.5})),
         "negative_acquire_us": ("OUT_OF_RANGE", _pack({**submit, "acquire_us": -1.0})),
     }
 
@@ -163,7 +202,7 @@ def _pack(message: dict[str, Any]) -> bytes:
 
 
 def _blob(name: str, value: Any) -> Any:
-    if name in _FLOATS:
+    if name in _FLOATS and isinstance(value, list):
         return b"".join(struct.pack(f"<{len(row)}f", *row) for row in value)
     if name in _BITS:
         return b"".join(np.packbits(np.array(row, dtype=bool), bitorder="little").tobytes() for row in value)

@@ -34,8 +34,6 @@ def test_every_route_is_named_with_its_request() -> None:
 
 def test_the_limit_is_the_formula() -> None:
     f, m, d = TABLE.n_free, TABLE.n_queries, TABLE.n_costly
-    assert (
-        "16,384 + b·M + max_bots · (37 + max(b·(F + 3), b·D + 4·M, 4·b)) with b = 9 in msgpack and 26 in JSON" in TEXT
-    )
+    assert "16,384 + b·M + max_bots · (37 + max(b·(F + D + 4) + 4·M, 5·b)) with b = 9 in msgpack and 26 in JSON" in TEXT
     for form, b in ((Format.MSGPACK, 9), (Format.JSON, 26)):
-        assert body_limit(TABLE, 8, form) == 16384 + b * m + 8 * (37 + max(b * (f + 3), b * d + 4 * m, 4 * b))
+        assert body_limit(TABLE, 8, form) == 16384 + b * m + 8 * (37 + max(b * (f + d + 4) + 4 * m, 5 * b))

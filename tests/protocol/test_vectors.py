@@ -15,7 +15,7 @@ from protocol import arrays, codec
 from protocol.client import BotClient
 from protocol.codec import Format
 from protocol.errors import ProtocolError
-from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures, Welcome
+from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures, TakeTurn, Welcome
 from protocol.replies import read_actions, read_bots_started, read_queries, read_reply, read_welcome
 from protocol.vectors.__main__ import write_vectors
 from tests.protocol.golden import BOTS, FOLDER, REFUSED, REPLIES, REQUESTS, TABLE, VECTORS, WELCOME, Vector
@@ -58,7 +58,9 @@ def _dense(message: Request | Reply) -> dict[str, Any]:
     match message:
         case RequestQueries():
             fields["free"] = arrays.floats(message.free, (len(message.bots), TABLE.n_free), "free").tolist()
-        case SubmitFeatures():
+        case SubmitFeatures() | TakeTurn():
+            if isinstance(message, TakeTurn):
+                fields["free"] = arrays.floats(message.free, (len(message.bots), TABLE.n_free), "free").tolist()
             shape = len(message.bots), TABLE.n_queries
             acquired = arrays.bits(message.acquired, shape, "acquired")
             dense = arrays.unpack_values(message.values, acquired, TABLE)
@@ -72,6 +74,8 @@ def _dense(message: Request | Reply) -> dict[str, Any]:
             )
         case Actions():
             fields["actions"] = arrays.floats(message.actions, (len(BOTS), WELCOME.action.size), "actions").tolist()
+            if message.hidden is not None:
+                fields["hidden"] = arrays.floats(message.hidden, (len(BOTS), 3), "hidden").tolist()
     return json.loads(json.dumps(fields))
 
 
@@ -92,7 +96,7 @@ def test_the_server_reads_requests_field_for_field_in_both_formats(vector: Vecto
         fields = _dense(codec.decode_request(body, form))
         given = {name: value for name, value in fields.items() if name in vector.message}
         assert given == _narrowed(vector.message)
-        assert all(value is None for name, value in fields.items() if name not in vector.message)
+        assert all(value is None or value is False for name, value in fields.items() if name not in vector.message)
 
 
 @pytest.mark.parametrize("vector", REPLIES, ids=name_of)
@@ -105,6 +109,9 @@ def test_the_server_writes_replies_byte_for_byte(vector: Vector) -> None:
         case Actions():
             action_NA = np.array(reply.actions, dtype=np.float32)
             reply = msgspec.structs.replace(reply, actions=arrays.pack_floats(action_NA, Format.MSGPACK))
+            if reply.hidden is not None:
+                hidden = arrays.pack_floats(np.array(reply.hidden, dtype=np.float32), Format.MSGPACK)
+                reply = msgspec.structs.replace(reply, hidden=hidden)
     assert codec.encode(reply, Format.MSGPACK) == vector.body
 
 
@@ -116,7 +123,7 @@ class Recorder:
 
     def exchange(self, kind: str, body: bytes, connection: str | None) -> bytes:
         self.sent.append(body)
-        answers = {asked: reply for reply, asked in REPLY_TO.items() if reply != "error"}
+        answers = {asked: reply for reply, asked in REPLY_TO.items() if reply != "error"} | {"take_turn": "actions"}
         return VECTORS[answers[kind]].body
 
     def close(self) -> None:
@@ -134,7 +141,7 @@ def _submission(vector: Vector) -> dict[str, Any]:
     acquired = np.array(vector.message["acquired"], dtype=bool)
     costly = np.full((len(BOTS), TABLE.n_costly), 49.0, dtype=np.float32)
     costly[acquired[:, TABLE.owner]] = np.concatenate([np.array(row, np.float32) for row in vector.message["values"]])
-    optional = {name: vector.message.get(name) for name in ("failed", "acquire_us")}
+    optional = {name: vector.message.get(name) for name in ("failed", "acquire_us", "hidden")}
     return {"bots": BOTS, "frame": 7, "acquired": acquired, "costly": costly, **optional}
 
 
@@ -144,14 +151,27 @@ def test_the_client_writes_requests_byte_for_byte() -> None:
     client.hello(bundle="golden@3")
     client.start(2)
     client.start(2, seeds=[1, 2**63 - 1], target_returns=[100, 50.5], budgets_us=[20, 0], target_costs_us=[4.5, 0])
+    client.start(2, seeds=[3, 4], turns=[0, 2**53])
     client.act(**_submission(VECTORS["submit_features"]))
     client.act(**_submission(VECTORS["submit_features_failed"]))
     client.act(**_submission(VECTORS["submit_features_measured"]))
+    client.act(**_submission(VECTORS["submit_features_hidden"]))
     client.stop(BOTS)
     client.close()
-    names = ["hello", "hello_cost_model_token", "hello_bundle", "start_bots", "start_bots_all"]
-    names += ["submit_features", "submit_features_failed", "submit_features_measured", "stop_bots", "goodbye"]
+    names = ["hello", "hello_cost_model_token", "hello_bundle", "start_bots", "start_bots_all", "start_bots_turns"]
+    names += ["submit_features", "submit_features_failed", "submit_features_measured"]
+    names += ["submit_features_hidden", "stop_bots", "goodbye"]
     assert recorder.sent == [VECTORS[name].body for name in names]
+
+
+@pytest.mark.parametrize("name", ["take_turn", "take_turn_all", "take_turn_replayed"])
+def test_the_client_writes_whole_turns_byte_for_byte(name: str) -> None:
+    client, recorder = _client()
+    said = VECTORS[name].message
+    optional = {key: said.get(key) for key in ("rewards", "frame_budget_us", "budgets_us", "target_costs_us")}
+    optional["replayed_returns_to_go"] = said.get("replayed_returns_to_go")
+    client.take(free=said["free"], **_submission(VECTORS[name]), **optional)
+    assert recorder.sent[-1] == VECTORS[name].body
 
 
 @pytest.mark.parametrize("name", ["request_queries", "request_queries_all"])
@@ -179,6 +199,10 @@ def test_the_client_reads_replies_field_for_field() -> None:
     said = VECTORS["actions"].message
     actions = read_actions(read_reply(VECTORS["actions"].body, "submit_features"), 2, WELCOME.action)
     assert (actions.actions.tolist(), actions.reasons.tolist()) == (said["actions"], said["reasons"])
+    assert (actions.turns.tolist(), actions.hidden) == (said["turns"], None)
+    said = VECTORS["actions_hidden"].message
+    actions = read_actions(read_reply(VECTORS["actions_hidden"].body, "take_turn"), 2, WELCOME.action)
+    assert (actions.turns.tolist(), actions.hidden.tolist()) == (said["turns"], said["hidden"])
     assert read_reply(VECTORS["bots_stopped"].body, "stop_bots")["count"] == 2
 
 
@@ -198,12 +222,16 @@ def _read(body: bytes) -> None:
     match request:
         case RequestQueries():
             arrays.floats(request.free, (len(request.bots), TABLE.n_free), "free")
-        case SubmitFeatures():
+        case SubmitFeatures() | TakeTurn():
             acquired = arrays.bits(request.acquired, (len(request.bots), TABLE.n_queries), "acquired")
             arrays.unpack_values(request.values, acquired, TABLE)
 
 
-READABLE = {"NON_FINITE", "OUT_OF_RANGE"}  # the bots refuse these: tests/server has them against a real server
+READABLE = {
+    "NON_FINITE",
+    "OUT_OF_RANGE",
+    "OVER_BUDGET",
+}  # the bots refuse these: tests/server has them against a real server
 
 
 @pytest.mark.parametrize("vector", REFUSED, ids=name_of)

@@ -58,6 +58,7 @@ def test_golden_refusals_at_the_http_door(served: Served, vector: Vector) -> Non
         headers = {**MSGPACK, "X-Bot-Connection": client.hello().connection}
         body = _for_these_bots(vector.body, client.start(2).tolist())
         path = "/v1/act" if b"submit_features" in body else "/v1/query"
+        path = "/v1/turn" if b"take_turn" in body else path
         path = "/v1/bots/start" if b"start_bot" in body or vector.name == "refused_too_deep" else path
         answer = http_request(served.addresses["http"], "POST", path, body, headers)
     error = msgpack.unpackb(answer.body)
