@@ -105,7 +105,7 @@ def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
 def read_welcome(reply: dict[str, Any]) -> Welcome:
     """The fields of a `welcome`; raises ReplyError."""
     with _reading("hello"):
-        target_cost_us, cost_quantile = reply.get("target_cost_us"), reply.get("cost_quantile")
+        replay_frames = reply.get("replay_frames")
         return Welcome(
             connection=str(reply["connection"]),
             bundle=str(reply["bundle"]),
@@ -118,10 +118,16 @@ def read_welcome(reply: dict[str, Any]) -> Welcome:
             context_length=int(reply["context_length"]),
             max_bots=int(reply["max_bots"]),
             max_body_bytes=int(reply["max_body_bytes"]),
-            target_cost_us=None if target_cost_us is None else float(target_cost_us),
-            cost_quantile=None if cost_quantile is None else float(cost_quantile),
+            target_cost_us=_float(reply.get("target_cost_us")),
+            cost_quantile=_float(reply.get("cost_quantile")),
             **_read_version(reply),
+            replay_frames=None if replay_frames is None else int(replay_frames),
+            target_return=_float(reply.get("target_return")),
         )
+
+
+def _float(number: Any) -> float | None:
+    return None if number is None else float(number)
 
 
 def read_bots_started(reply: dict[str, Any], welcome: Welcome) -> tuple[NDArray[np.int64], Welcome]:

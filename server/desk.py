@@ -14,7 +14,7 @@ from functools import partial
 from protocol import codec
 from protocol.codec import Format
 from protocol.errors import NotReady, ProtocolError
-from protocol.messages import Request, RequestQueries, SubmitFeatures
+from protocol.messages import Request, RequestQueries, SubmitFeatures, TakeTurn
 from server.answer import Answer, Arrival, answer, refusal
 from server.handlers import Handlers
 from server.worker import Worker
@@ -85,7 +85,7 @@ class Desk:
         except ProtocolError:
             return how(body, form, connection_id)  # which refuses it, bots untouched
         decoded = partial(how, request, form, connection_id, decoded_ns=time.monotonic_ns())
-        if not isinstance(request, RequestQueries | SubmitFeatures):
+        if not isinstance(request, RequestQueries | SubmitFeatures | TakeTurn):
             return self._hop(decoded, arrival, reply_form or form)
         turn = type(request), len(request.bots).bit_length()
         job = partial(self._timed, turn, decoded)

@@ -42,7 +42,7 @@ def requests(recorder: Recorder) -> Iterator[Metric]:
     whole = _histogram("request_seconds", "From a request read whole to its reply encoded.", ("transport", "message"))
     phase = _histogram(
         "request_phase_seconds",
-        "Of one half of a turn: waiting for its turn, decoding, inference, encoding.",
+        "Of a turn or half of one: waiting for its turn, decoding, inference, encoding.",
         ("transport", "message", "phase"),
     )
     bots = _histogram("message_bots", "Bots in one message of a turn.", ("transport", "message"))

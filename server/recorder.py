@@ -11,7 +11,7 @@ import threading
 from bisect import bisect_left
 from typing import NamedTuple
 
-from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures
+from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures, TakeTurn
 
 __all__ = ["BATCH_BOUNDS", "NS_BOUNDS", "PHASES", "WHOLE", "Histograms", "Recorder", "Spans"]
 
@@ -22,7 +22,7 @@ NS_BOUNDS = tuple(round(bound_us * 1e3) for bound_us in (*_BOUNDS_US, *_LONG_BOU
 BATCH_BOUNDS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 PHASES = ("wait", "decode", "inference", "encode")
 WHOLE = len(PHASES)  # the histogram after those of the phases
-_HALF_TURNS, _HALF_REPLIES = (RequestQueries, SubmitFeatures), (Queries, Actions)
+_TURNS, _TURN_REPLIES = (RequestQueries, SubmitFeatures, TakeTurn), (Queries, Actions)
 
 
 class Spans(NamedTuple):
@@ -38,7 +38,7 @@ class Histograms:
     """Of one transport's requests of one type: ns in each phase, ns of the whole, and bots a message.
 
     `counts[i][j]` is how many of histogram i fell at or below bound j and above the one before it, `totals[i]` their
-    sum. Where a message is no half of a turn, only the whole is counted.
+    sum. Where a message is no turn or half of one, only the whole is counted.
     """
 
     __slots__ = ("batches", "bots", "counts", "totals")
@@ -88,7 +88,7 @@ class Recorder:
         histograms = self.answers.get(key)
         if histograms is None:
             histograms = self.answers[key] = Histograms()
-        if isinstance(reply, _HALF_REPLIES) and isinstance(request, _HALF_TURNS):
+        if isinstance(reply, _TURN_REPLIES) and isinstance(request, _TURNS):
             histograms.count_half_turn(spans, reply.infer_us, len(request.bots))
         else:
             histograms.count(spans.whole_ns)
