@@ -64,6 +64,7 @@ class Conversation(asyncio.Protocol):
         try:
             self._sockets.add(self)
         except TooManyConnections as error:
+            self._sockets.desk.handlers.recorder.refused(self.name, error.code)
             self._transport.write(self._framed(refusal(error, Format.MSGPACK).body))
             self._close()
 
@@ -116,6 +117,7 @@ class Conversation(asyncio.Protocol):
         try:
             body = self._next()
         except TooLarge as error:
+            self._sockets.desk.handlers.recorder.refused(self.name, error.code)
             self._refuse(error)
             return
         if body is None:

@@ -38,23 +38,27 @@ _COUNTED = {  # of `bot_runtime.spent.Spent`
 
 
 def requests(recorder: Recorder) -> Iterator[Metric]:
-    """Time of whole requests and of their phases, bots a message, and refusals."""
-    whole = _histogram("request_seconds", "From a request read whole to its reply encoded.", ("transport", "message"))
-    phase = _histogram(
-        "request_phase_seconds",
-        "Of a turn or half of one: waiting for its turn, decoding, inference, encoding.",
-        ("transport", "message", "phase"),
-    )
-    bots = _histogram("message_bots", "Bots in one message of a turn.", ("transport", "message"))
-    for (transport, kind), histograms in list(recorder.answers.items()):
-        labels = [transport, str(kind.__struct_config__.tag)]
+    """Time of whole requests and of their phases, bots a message, and refusals; each built when it is asked for."""
+    answers = [
+        ([transport, str(kind.__struct_config__.tag)], histograms)
+        for (transport, kind), histograms in list(recorder.answers.items())
+    ]
+    turns = [(labels, histograms) for labels, histograms in answers if any(histograms.batches)]
+    help_text = "From a request read whole to its reply encoded."
+    whole = _histogram("request_seconds", help_text, ("transport", "message"))
+    for labels, histograms in answers:
         _fill(whole, labels, _SECONDS, histograms.counts[WHOLE], histograms.totals[WHOLE] / 1e9)
-        if not any(histograms.batches):
-            continue
+    yield whole
+    help_text = "Of a turn or half of one: waiting for its turn, decoding, inference, encoding."
+    phase = _histogram("request_phase_seconds", help_text, ("transport", "message", "phase"))
+    for labels, histograms in turns:
         for index, name in enumerate(PHASES):
             _fill(phase, [*labels, name], _SECONDS, histograms.counts[index], histograms.totals[index] / 1e9)
+    yield phase
+    bots = _histogram("message_bots", "Bots in one message of a turn.", ("transport", "message"))
+    for labels, histograms in turns:
         _fill(bots, labels, _BATCHES, histograms.batches, histograms.bots)
-    yield from (whole, phase, bots)
+    yield bots
     yield _counter("refused", "Refused requests.", ("transport", "code"), dict(recorder.refusals))
 
 

@@ -63,6 +63,7 @@ class HttpDoor:
             answered = self._desk.ask(body, form, connection, arrival, kind=kind, reply_form=reply_form)
             return _response(answered if isinstance(answered, Answer) else await answered, reply_form)
         except ProtocolError as error:
+            self._handlers.recorder.refused("http", error.code)
             return _refused(error, reply_form or Format.JSON)
         except ClientDisconnect:
             return Response(status_code=400)  # nobody is there to read it

@@ -8,13 +8,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterable, Iterator
 
-from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
+from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.metrics_core import Metric
-from prometheus_client.registry import Collector
 
-__all__ = ["CONTENT_TYPE", "Metrics"]
+from server.exposition import pieces
 
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+__all__ = ["Metrics"]
+
 Source = Callable[[], Iterable[Metric]]
 
 
@@ -34,19 +34,9 @@ class Metrics:
             yield from source()
 
     async def text(self) -> bytes:
-        """Every family, written family by family, with the event loop's other work in between."""
+        """Every family, written piece by piece, with the event loop's other work in between."""
         written = []
-        for family in self.collect():
-            written.append(generate_latest(_One(family)))
+        for piece in pieces(self.collect()):
+            written.append(piece)
             await asyncio.sleep(0)
-        return b"".join(written)
-
-
-class _One(Collector):
-    """A collector of one family."""
-
-    def __init__(self, family: Metric) -> None:
-        self._family = family
-
-    def collect(self) -> Iterable[Metric]:
-        return (self._family,)
+        return "".join(written).encode()

@@ -9,9 +9,10 @@ import msgspec
 from starlette.requests import Request
 from starlette.responses import Response
 
-from protocol.errors import NotReady, ProtocolError
+from protocol.errors import NotReady, ProtocolError, Unauthorized
+from server.exposition import CONTENT_TYPE
 from server.handlers import Handlers
-from server.metrics import CONTENT_TYPE, Metrics
+from server.metrics import Metrics
 from server.readiness import Readiness
 
 __all__ = ["Probes", "check_bearer"]
@@ -54,4 +55,8 @@ class Probes:
 def check_bearer(handlers: Handlers, request: Request) -> None:
     """Raise Unauthorized unless the request carries the server's token, or it has none."""
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
-    handlers.check_token(token if scheme.lower() == "bearer" else None)
+    try:
+        handlers.check_token(token if scheme.lower() == "bearer" else None)
+    except Unauthorized as error:
+        handlers.recorder.refused("http", error.code)
+        raise

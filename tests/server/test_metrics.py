@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from protocol.client import BotClient
 from protocol.errors import NoBot
 from tests.protocol.golden import TABLE
-from tests.server.serving import Served, costly_numbers, free_numbers, http_request, play, serve
+from tests.server.serving import RawStream, Served, costly_numbers, free_numbers, http_request, play, serve
 
 N = 3
 
@@ -120,3 +120,24 @@ def test_metrics_need_the_token(bundle: Path, tmp_path: Path) -> None:
         assert not any("s3cret" in str(sample) for sample in scrape.samples)
         for path in ("/healthz", "/readyz"):
             assert http_request(guarded.addresses["http"], "GET", path).status == 200
+
+
+def test_what_a_door_refuses_is_counted_too(bundle: Path, tmp_path: Path) -> None:
+    with serve(bundle, tmp_path / "s", max_connections=1, token="s3cret") as server:
+        with RawStream(server.addresses["tcp"]) as first, RawStream(server.addresses["unix"]) as second:
+            assert second.reply()["code"] == "TOO_MANY_CONNECTIONS"
+            first.socket.sendall(b"\x7f\xff\xff\xff")
+            assert first.reply()["code"] == "TOO_LARGE"
+        http = server.addresses["http"]
+        assert http_request(http, "POST", "/v1/query", b"x", {"Content-Type": "text/plain"}).status == 415
+        assert http_request(http, "GET", "/v1/costs").status == 401
+        assert http_request(http, "POST", "/v1/connections", b"{", {"Content-Type": "application/json"}).status == 400
+        scrape = Scrape(server, Authorization="Bearer s3cret")
+    refused = {(s.labels["transport"], s.labels["code"]): s.value for s in scrape.samples if "refused" in s.name}
+    assert refused == {
+        ("unix", "TOO_MANY_CONNECTIONS"): 1,
+        ("tcp", "TOO_LARGE"): 1,
+        ("http", "UNSUPPORTED_MEDIA_TYPE"): 1,
+        ("http", "UNAUTHORIZED"): 1,
+        ("http", "BAD_JSON"): 1,
+    }
