@@ -5,6 +5,7 @@ This module knows nothing about requests being served.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -41,6 +42,7 @@ def document(app: FastAPI) -> None:
     """Add the message routes and their schemas to the application's OpenAPI document."""
     draw = app.openapi
 
+    @cache  # drawing takes milliseconds of the event loop, and anybody may ask for it
     def openapi() -> dict[str, Any]:
         drawn = draw()
         drawn["paths"].update({path: {"post": _operation(*pair)} for path, pair in ROUTES.items()})

@@ -1,0 +1,157 @@
+"""Are slow clients closed in time, and does anybody else notice them?
+
+Opens slow sockets to one door after the other (`benchmarks.slow_clients`: silent, a byte a second of a header or of a
+body, never reading) while a client plays turns over the Unix socket. *Other bots' p99* is that of the client's turns
+while they are open, over that of the same run's turns before and after.
+
+    python -m benchmarks.slow_sockets --json
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.recorded import Timed, over
+from benchmarks.slow_clients import BOTS, KINDS, Held, hold
+from bot_runtime.bundle import Bundle
+from bot_runtime.golden import read_golden
+from game.launcher import ServerProcess
+from protocol.client import BotClient
+
+__all__ = ["Door", "SlowSockets", "main", "measure", "passed"]
+
+_WARM_UP = 50
+
+
+@dataclass(frozen=True)
+class SlowSockets:
+    """Open slow sockets to each door."""
+
+    bundle: Path = Path("bundles/hard")
+    sockets: int = 500  # to each door
+    bots: int = 8  # of the client that plays meanwhile
+    quiet_s: float = 5.0  # how long it plays alone, before and after
+    deadline_s: float = 3.0  # within which the server is to close them
+    tolerance_s: float = 1.0
+    patience_s: float = 30.0  # how much longer than the deadline is waited for what is not closed
+    most_p99: float = 1.5  # times that without them
+    json: bool = False  # print one JSON line instead of a table
+
+
+@dataclass(frozen=True)
+class Door:
+    """What was found at one door; times in seconds, `None` where a socket was still open when waiting ended."""
+
+    sockets: int
+    slowest_s: dict[str, float | None]  # by kind
+    late: int  # sockets that were not closed in time
+    quiet_p99_us: float
+    p99_us: float
+
+    @property
+    def p99_ratio(self) -> float:
+        """The other bots' p99 over that without slow sockets."""
+        return self.p99_us / self.quiet_p99_us
+
+
+def measure(config: SlowSockets) -> dict[str, Door]:
+    """Every door in turn, against a server of one's own."""
+    bundle = Bundle.load(config.bundle)
+    golden = read_golden((config.bundle / "golden.npz").read_bytes(), bundle.manifest)
+    arguments = ["--tcp-port", "0", "--max-connections", str(config.sockets + 16)]
+    arguments += ["--max-bots", str(config.bots + 2 * BOTS), "--frame-deadline-s", str(config.deadline_s)]
+    context = multiprocessing.get_context("spawn")
+    with ServerProcess(config.bundle, *arguments) as server, ProcessPoolExecutor(1, mp_context=context) as aside:
+        addresses = server.addresses()
+        with BotClient(addresses["unix"]) as client:
+            turn = over(client, bundle, golden, config.bots)
+            aside.submit(hold, addresses["tcp"], 1, 0.0).result()  # its process has started
+            for _ in range(_WARM_UP):
+                turn()
+            doors = {}
+            for name, address in addresses.items():
+                before = _turns(turn, _for(config.quiet_s))
+                holding = aside.submit(hold, address, config.sockets, config.deadline_s + config.patience_s)
+                meanwhile = _turns(turn, _until(holding))
+                after = _turns(turn, _for(config.quiet_s))
+                doors[name] = _door(config, holding.result(), before + after, meanwhile)
+    return doors
+
+
+def _for(seconds: float) -> Callable[[], bool]:
+    end_s = time.monotonic() + seconds
+    return lambda: time.monotonic() >= end_s
+
+
+def _until(holding: Future[list[Held]]) -> Callable[[], bool]:
+    return holding.done
+
+
+def _turns(turn: Callable[[], Timed], over_yet: Callable[[], bool]) -> list[float]:
+    """µs of each turn until it is over."""
+    whole_us = []
+    while not over_yet():
+        whole_us.append(turn()[0])
+    return whole_us
+
+
+def _door(config: SlowSockets, held: list[Held], quiet_us: list[float], us: list[float]) -> Door:
+    most_s = config.deadline_s + config.tolerance_s
+    slowest = {}
+    for kind in KINDS:
+        open_s = [each.open_s for each in held if each.kind == kind]
+        slowest[kind] = None if None in open_s else max((s for s in open_s if s is not None), default=0.0)
+    late = sum(each.open_s is None or each.open_s > most_s for each in held)
+    return Door(len(held), slowest, late, float(np.percentile(quiet_us, 99)), float(np.percentile(us, 99)))
+
+
+def passed(config: SlowSockets, doors: dict[str, Door]) -> bool:
+    """Whether every socket was closed in time and no door's slow sockets slowed others more than allowed."""
+    return all(door.late == 0 and door.p99_ratio <= config.most_p99 for door in doors.values())
+
+
+def _table(doors: dict[str, Door]) -> Table:
+    table = Table(title="slow sockets: seconds until closed, and other bots' turns")
+    for name in ("door", "sockets", *KINDS, "late", "p99 without, µs", "p99, µs", "ratio"):
+        table.add_column(name, justify="left" if name == "door" else "right")
+    for name, door in doors.items():
+        seconds = ["never" if s is None else f"{s:.2f}" for s in door.slowest_s.values()]
+        us = f"{door.quiet_p99_us:,.0f}", f"{door.p99_us:,.0f}", f"{door.p99_ratio:.2f}"
+        table.add_row(name, str(door.sockets), *seconds, str(door.late), *us)
+    return table
+
+
+def _line(door: Door) -> dict[str, Any]:
+    slowest = {kind: None if s is None else round(s, 2) for kind, s in door.slowest_s.items()}
+    line = {"sockets": door.sockets, "slowest_s": slowest, "late": door.late}
+    line |= {"quiet_p99_us": round(door.quiet_p99_us, 1), "p99_us": round(door.p99_us, 1)}
+    return line | {"p99_ratio": round(door.p99_ratio, 2)}
+
+
+def main() -> None:
+    """Command line; ends with 1 unless all were closed in time and nobody else was slowed."""
+    config = tyro.cli(SlowSockets, description=__doc__)
+    doors = measure(config)
+    done = passed(config, doors)
+    if config.json:
+        print(json.dumps({**{name: _line(door) for name, door in doors.items()}, "passed": done}))
+    else:
+        Console().print(_table(doors))
+    sys.exit(not done)
+
+
+if __name__ == "__main__":
+    main()
