@@ -20,13 +20,34 @@ if TYPE_CHECKING:  # a bundle is verified by running its policy, so the import c
     from bot_runtime.bundle import Bundle
     from bot_runtime.manifest import Manifest
 
-__all__ = ["Policy"]
+__all__ = ["Acquisition", "Policy"]
 
 _FATAL_ONLY = 4
 _FLOAT = "tensor(float)"
 _Port = tuple[str, tuple[int | None, ...]]  # ONNX element type and shape, None where the axis is the batch
 _Ports = dict[str, _Port]
 _Arrays = dict[str, NDArray[Any]]
+
+
+class Acquisition:
+    """The session of the acquisition graph: all that an engine with a head of its own runs. Raises as Policy does."""
+
+    def __init__(self, manifest: Manifest, graph: bytes, threads: int = 1) -> None:
+        self._manifest = manifest
+        self.session = _session("acquisition.onnx", graph, threads)
+        _check_ports("acquisition.onnx", self.session, *_acquisition_ports(manifest))
+
+    def query_probs(self, batch: Batch) -> None:
+        """Bernoulli means of each bot's query (π̂ of the paper, reading the state after the last turn), and what the
+        action graph needs of what is known before it: from `before_NX` and `target_cost_N1` to `probs_NM`, `asked_NE`.
+
+        Target costs are shares of each bot's full cost in [0, 1], of no effect unless the network is conditioned on
+        them.
+        """
+        run = batch.runs.get("acquisition")
+        if run is None:
+            run = batch.runs["acquisition"] = _bound(self.session, *_acquisition_arrays(self._manifest, batch))
+        run()
 
 
 class Policy:
@@ -38,22 +59,13 @@ class Policy:
 
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
         self._manifest = bundle.manifest
-        self._acquisition = _session("acquisition.onnx", bundle.acquisition, threads)
+        self._acquisition = Acquisition(bundle.manifest, bundle.acquisition, threads)
         self._action = _session("action.onnx", bundle.action, threads)
-        _check_ports("acquisition.onnx", self._acquisition, *_acquisition_ports(bundle.manifest))
         _check_ports("action.onnx", self._action, *_action_ports(bundle.manifest))
 
     def query_probs(self, batch: Batch) -> None:
-        """Bernoulli means of each bot's query (π̂ of the paper, reading the state after the last turn), and what the
-        action graph needs of what is known before it: from `before_NX` and `target_cost_N1` to `probs_NM`, `asked_NE`.
-
-        Target costs are shares of each bot's full cost in [0, 1], of no effect unless the network is conditioned on
-        them.
-        """
-        run = batch.runs.get("acquisition")
-        if run is None:
-            run = batch.runs["acquisition"] = _bound(self._acquisition, *_acquisition_arrays(self._manifest, batch))
-        run()
+        """The first graph: see `Acquisition`."""
+        self._acquisition.query_probs(batch)
 
     def act(self, batch: Batch) -> None:
         """One incremental trunk step for every bot (π̃ of the paper), to `action_NA`, `hidden_NW` and `tokens`.
@@ -72,7 +84,7 @@ class Policy:
         A golden episode has one bot, and exporters like to freeze a batch of one.
         """
         for session, (inputs, outputs) in (
-            (self._acquisition, _acquisition_ports(self._manifest)),
+            (self._acquisition.session, _acquisition_ports(self._manifest)),
             (self._action, _action_ports(self._manifest)),
         ):
             feed = {
