@@ -13,15 +13,16 @@ from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, supp
 from functools import partial
 
 import uvicorn
-from fastapi import FastAPI
 
 from bot_runtime.bundle import Bundle
 from server.connections import Connections
 from server.desk import Desk
+from server.exchange import Exchange
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
 from server.observation import watch
 from server.probes import Probes
+from server.prompt import prompt_http
 from server.serving import Serving
 from server.servings import Servings
 from server.settings import Settings
@@ -56,8 +57,8 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             idle_ttl_s=settings.idle_ttl_s,
         )
         readiness, metrics = watch(settings, handlers, connections, worker, sockets)
-        http = HttpDoor(desk, worker, body_deadline_s=settings.frame_deadline_s)
-        application = create_app(http, Probes(handlers, readiness, metrics))
+        rest = create_app(HttpDoor(handlers, worker), Probes(handlers, readiness, metrics))
+        application = Exchange(desk, rest, body_deadline_s=settings.frame_deadline_s)
         uvicorn_server, http_address = await stack.enter_async_context(_http(settings, application))
         addresses = {"http": http_address, **await stack.enter_async_context(_streams(settings, sockets))}
         await stack.enter_async_context(_sweeping(handlers, worker, settings.idle_ttl_s / 4))
@@ -77,12 +78,12 @@ class _Uvicorn(uvicorn.Server):
 
 
 @asynccontextmanager
-async def _http(settings: Settings, application: FastAPI) -> AsyncIterator[tuple[uvicorn.Server, str]]:
+async def _http(settings: Settings, application: Exchange) -> AsyncIterator[tuple[uvicorn.Server, str]]:
     listening = _listen(settings.host, settings.port)
     server = _Uvicorn(
         uvicorn.Config(
             application,
-            http="httptools",
+            http=prompt_http(settings.frame_deadline_s),
             ws="none",
             lifespan="off",
             log_config=None,
