@@ -135,6 +135,7 @@ class TurnTarget:
             answered | {"acquired": bytes(size), "values": b"", "failed": answered["acquired"]},
             desk.request(PENDING_FRAME),
             *(desk.request(frame) | {"rewards": [1.0, -1.0]} for frame in (8, 9)),
+            answered | desk.request(PENDING_FRAME + 1) | {"type": "take_turn", "hidden": True},
         ]
         self.seeds = _requests([message | ({"bots": BOTS} if "bots" in message else {}) for message in legal])
         self.change = _changed_message

@@ -71,6 +71,12 @@ class Engine(NamedTuple):
         message = {"frame": self.frame, "bots": self.bots.tolist(), "values": values.tobytes()}
         return self.post("/v1/act", message | {"acquired": _bits(asked)} | changes)
 
+    def over_budget(self) -> str:
+        """A whole turn of the next frame in which everything was acquired, with a budget for nothing."""
+        free = free_numbers(TABLE, N, self.frame + 1).tobytes()
+        message = {"frame": self.frame + 1, "bots": self.bots.tolist(), "free": free, "budgets_us": [0.0] * N}
+        return self.post("/v1/turn", message | {"acquired": ALL, "values": EVERY_VALUE})
+
 
 def _bits(array_NM: np.ndarray) -> bytes:
     return np.packbits(array_NM, axis=1, bitorder="little").tobytes()
@@ -116,6 +122,7 @@ BETWEEN: dict[str, Provoked] = {
     "UNSUPPORTED_MEDIA_TYPE": lambda engine: engine.post("/v1/query", b"", form="x-pickle"),
     "NO_ROUTE": lambda engine: engine.post("/v1/pickle", b""),
     "METHOD_NOT_ALLOWED": lambda engine: engine.post("/v1/query", b"", method="DELETE"),
+    "OVER_BUDGET": Engine.over_budget,
     "INTERNAL": _internal,
 }
 # The rest is refused only while a query is pending; every error that is possible then is tried then as well.
