@@ -44,7 +44,7 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
     """
     servings = Servings(settings.max_bots)
     servings.activate(Serving(Bundle.load(settings.bundle), max_bots=settings.max_bots))
-    connections = Connections(settings.max_connections, settings.idle_ttl_s, clock)
+    connections = Connections(settings.max_connections, settings.idle_ttl_s, clock, process=settings.process)
     handlers = Handlers(servings, connections, settings.token)
     async with AsyncExitStack() as stack:
         worker = Worker(settings.max_queue)

@@ -46,10 +46,22 @@ class Connection:
 
 
 class Connections:
-    """Every open connection, by its unguessable name. `clock` is monotonic, in seconds."""
+    """Every open connection, by its unguessable name. `clock` is monotonic, in seconds.
 
-    def __init__(self, max_connections: int, idle_ttl_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+    Names begin with `process` and a hyphen where there is one, so that a front knows which of several processes holds a
+    connection.
+    """
+
+    def __init__(
+        self,
+        max_connections: int,
+        idle_ttl_s: float,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        process: str | None = None,
+    ) -> None:
         self._by_id: dict[str, Connection] = {}
+        self._prefix = "" if process is None else f"{process}-"
         self._max_connections = max_connections
         self._idle_ttl_s = idle_ttl_s
         self._clock = clock
@@ -64,7 +76,8 @@ class Connections:
         """A new connection to bots of `serving`; raises TooManyConnections."""
         if len(self._by_id) >= self._max_connections:
             raise TooManyConnections(f"all {self._max_connections} connections are taken", retry_after_s=1.0)
-        connection = Connection(secrets.token_hex(16), serving, Costs(cost_model), self._clock(), is_pinned)
+        name = self._prefix + secrets.token_hex(16)
+        connection = Connection(name, serving, Costs(cost_model), self._clock(), is_pinned)
         self._by_id[connection.id] = connection
         return connection
 

@@ -6,10 +6,13 @@ This module knows nothing about how any of it is used; `python -m server --help`
 from __future__ import annotations
 
 import ipaddress
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 __all__ = ["Settings"]
+
+_PROCESS = re.compile(r"[a-z0-9]{1,16}")
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,9 @@ class Settings:
     """What Hello must carry. Required unless the host is a loopback address."""
     insecure_no_token: bool = False
     """Listen on other than loopback addresses without a token: for networks that only trusted machines are on."""
+    process: str | None = None
+    """Name of this process among several behind one front, lower-case letters and digits: connections' names begin with
+    it, so that the front knows where each of them is held."""
     ready_file: Path | None = None
     """Written once everything listens: JSON of the addresses (`http`, `tcp`, `unix`) and `pid`. Removed at the end."""
 
@@ -57,6 +63,8 @@ class Settings:
             raise ValueError("idle_ttl_s, frame_deadline_s, stuck_after_s and drain_s must be positive")
         if not self.inline_us >= 0:
             raise ValueError("inline_us must not be negative")
+        if self.process is not None and not _PROCESS.fullmatch(self.process):
+            raise ValueError(f"process {self.process[:80]!r} does not match {_PROCESS.pattern}")
         if self.token == "":
             raise ValueError("the token must not be empty")
         if self.token is None and not self.insecure_no_token and not _is_loopback(self.host):

@@ -38,6 +38,18 @@ def test_limits_and_names(serving: Serving) -> None:
     assert connections.open(COSTS, serving).id != only.id
 
 
+def test_names_begin_with_the_process_that_holds_them(serving: Serving) -> None:
+    """And are as unguessable as any."""
+    connections = Connections(2, 10.0, FakeClock(), process="p1")
+    one, other = connections.open(COSTS, serving), connections.open(COSTS, serving)
+    assert one.id.startswith("p1-")
+    assert len(one.id) == len("p1-") + 32
+    assert one.id != other.id
+    assert connections.get(one.id) is one
+    with pytest.raises(NoConnection):
+        connections.get(one.id.removeprefix("p1-"))
+
+
 def test_a_connection_names_its_own_bots(serving: Serving) -> None:
     connection = Connections(1, 10.0, FakeClock()).open(COSTS, serving)
     connection.bots.update({3, 4})

@@ -27,3 +27,10 @@ def test_any_other_address_needs_a_token_or_an_explicit_word(host: str) -> None:
 def test_limits_are_positive(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="must"):
         Settings(bundle=Path("b"), **wrong)
+
+
+@pytest.mark.parametrize("process", ["", "P1", "p-1", "p" * 17, "p1\n"])
+def test_a_process_is_named_by_letters_and_digits(process: str) -> None:
+    with pytest.raises(ValueError, match="process"):
+        Settings(bundle=Path("b"), process=process)
+    assert Settings(bundle=Path("b"), process="p1").process == "p1"
