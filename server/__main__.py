@@ -1,4 +1,4 @@
-"""`python -m server --bundle bundles/hard`: serve until SIGTERM or Ctrl-C, then drain and exit with 0.
+"""`python -m server --bundle bundles/hard` or `--store FOLDER`: serve until SIGTERM or Ctrl-C, drain, exit with 0.
 
 This module knows nothing about what is served.
 """
@@ -30,7 +30,7 @@ async def _serve(settings: Settings) -> None:
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(signal_number, stop.set)
     async with running(settings) as addresses:
-        _log.info("serving %s at %s", settings.bundle, ", ".join(addresses.values()))
+        _log.info("serving %s at %s", settings.bundle or settings.store, ", ".join(addresses.values()))
         try:
             if settings.ready_file is not None:
                 _write(settings.ready_file, {**addresses, "pid": os.getpid()})
@@ -52,7 +52,7 @@ def main() -> None:
     """Parse the command line and serve. Exits with 2 for settings or a bundle that cannot be served."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
-        settings = tyro.cli(Settings, description="Serve one bundle to game engines.")
+        settings = tyro.cli(Settings, description="Serve bundles to game engines.")
         uvloop.run(_serve(settings))
     except (ValueError, BadBundle, OSError) as error:
         _log.error("%s", error)

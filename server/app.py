@@ -15,6 +15,9 @@ from functools import partial
 import uvicorn
 
 from bot_runtime.bundle import Bundle
+from bot_runtime.signature import Keys
+from server.admin import AdminDoor, add_routes
+from server.catalogue import Catalogue
 from server.connections import Connections
 from server.desk import Desk
 from server.exchange import Exchange
@@ -27,6 +30,7 @@ from server.serving import Serving
 from server.servings import Servings
 from server.settings import Settings
 from server.sockets import Sockets
+from server.store import Store
 from server.stream import StreamSocket
 from server.worker import Worker
 
@@ -42,13 +46,14 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
     On leaving it is not ready at once, closes idle sockets, answers what is in progress for at most `drain_s`, and
     leaves no thread, socket or file behind. `clock` is what connections age by. Raises BadBundle, OSError.
     """
-    servings = Servings(settings.max_bots)
-    servings.activate(Serving(Bundle.load(settings.bundle), max_bots=settings.max_bots))
+    token, admin_token = settings.tokens()
+    servings = Servings(settings.max_bots, settings.max_loaded)
     connections = Connections(settings.max_connections, settings.idle_ttl_s, clock, process=settings.process)
-    handlers = Handlers(servings, connections, settings.token)
+    handlers = Handlers(servings, connections, token)
     async with AsyncExitStack() as stack:
         worker = Worker(settings.max_queue)
         stack.callback(worker.close)
+        admin = AdminDoor(handlers, worker, _filled(servings, worker, settings), admin_token=admin_token)
         desk = Desk(handlers, worker, inline_us=settings.inline_us)
         sockets = Sockets(
             desk,
@@ -58,6 +63,7 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
         )
         readiness, metrics = watch(settings, handlers, connections, worker, sockets)
         rest = create_app(HttpDoor(handlers, worker), Probes(handlers, readiness, metrics))
+        add_routes(rest, admin)
         application = Exchange(desk, rest, body_deadline_s=settings.frame_deadline_s)
         uvicorn_server, http_address = await stack.enter_async_context(_http(settings, application))
         addresses = {"http": http_address, **await stack.enter_async_context(_streams(settings, sockets))}
@@ -67,6 +73,20 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
         finally:
             readiness.is_draining = True
             uvicorn_server.should_exit = True  # drains in its own task while the streams are drained here
+
+
+def _filled(servings: Servings, worker: Worker, settings: Settings) -> Catalogue | None:
+    """Load what is to be served; the catalogue of the store if there is one."""
+    if settings.store is not None:
+        catalogue = Catalogue(
+            Store(settings.store), servings, worker, max_bots=settings.max_bots, keys=settings.signing_key
+        )
+        catalogue.open()
+        return catalogue
+    if settings.bundle is not None:
+        keys = Keys.read(settings.signing_key) if settings.signing_key else None
+        servings.activate(Serving(Bundle.load(settings.bundle, keys=keys), max_bots=settings.max_bots))
+    return None
 
 
 class _Uvicorn(uvicorn.Server):

@@ -6,8 +6,6 @@ before any bot is touched, so a refused request leaves every bot as it was.
 
 from __future__ import annotations
 
-import hmac
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +14,7 @@ from bot_runtime.costs import Report
 from bot_runtime.inputs import check_costs
 from protocol import arrays
 from protocol.codec import Format
-from protocol.errors import BadSchema, Unauthorized
+from protocol.errors import BadSchema
 from protocol.features import CostModel
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -40,6 +38,7 @@ from server.connections import Connection, Connections
 from server.recorder import Recorder
 from server.serving import Serving
 from server.servings import Servings
+from server.tokens import check
 
 __all__ = ["Handlers"]
 
@@ -98,10 +97,8 @@ class Handlers:
 
     def check_token(self, token: str | None) -> None:
         """Raise Unauthorized unless this is the server's token, or it has none. Takes equally long either way."""
-        if self._token is None:
-            return
-        if token is None or not hmac.compare_digest(token.encode(), self._token.encode()):
-            raise Unauthorized("the token is missing or wrong")
+        if self._token is not None:
+            check(token, self._token)
 
     def _hello(self, hello: Hello, connection_id: str | None, form: Format) -> Welcome:
         self.check_token(hello.token)

@@ -14,6 +14,7 @@ from server.exposition import CONTENT_TYPE
 from server.handlers import Handlers
 from server.metrics import Metrics
 from server.readiness import Readiness
+from server.tokens import bearer
 
 __all__ = ["Probes", "check_bearer"]
 
@@ -54,9 +55,8 @@ class Probes:
 
 def check_bearer(handlers: Handlers, request: Request) -> None:
     """Raise Unauthorized unless the request carries the server's token, or it has none."""
-    scheme, _, token = request.headers.get("authorization", "").partition(" ")
     try:
-        handlers.check_token(token if scheme.lower() == "bearer" else None)
+        handlers.check_token(bearer(request.headers.get("authorization", "")))
     except Unauthorized as error:
         handlers.recorder.refused("http", error.code)
         raise

@@ -9,23 +9,26 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from protocol.codec import Format
-from protocol.errors import NoBundle, TooManyBots
+from protocol.errors import NoBundle, NotReady, TooManyBots
 from server.serving import Serving
 
 __all__ = ["Servings"]
 
+_RETRY_AFTER_S = 1.0
+
 
 class Servings:
-    """Every bundle in memory. All of them together serve at most `max_bots` bots.
+    """Every bundle in memory, at most `max_loaded`. All of them together serve at most `max_bots` bots.
 
     A connection holds the serving that it was opened with, so that what it was told stays true; a serving that is no
     longer active is forgotten with its last connection.
     """
 
-    def __init__(self, max_bots: int) -> None:
+    def __init__(self, max_bots: int, max_loaded: int = 8) -> None:
         self._active: dict[str, Serving] = {}
         self._loaded: list[Serving] = []
         self._max_bots = max_bots
+        self._max_loaded = max_loaded
         self.max_body_bytes = dict.fromkeys(Format, 0)
 
     def __iter__(self) -> Iterator[Serving]:
@@ -35,6 +38,10 @@ class Servings:
     def n_bots(self) -> int:
         """How many bots there are, of all bundles."""
         return sum(serving.bots.n_bots for serving in self._loaded)
+
+    def active(self, name: str) -> Serving | None:
+        """The active one of this name, if there is one."""
+        return self._active.get(name)
 
     def named(self, bundle: str | None) -> Serving:
         """The active one of this name, or NAME@VERSION in memory; None is the only name there is. Raises NoBundle."""
@@ -55,8 +62,13 @@ class Servings:
         return active if active is not serving and active.keeps_promises_of(serving) else serving
 
     def activate(self, serving: Serving) -> None:
-        """From now on new connections get this one where they would have got the one of the same name."""
+        """From now on new connections get this one where they would have got the one of the same name.
+
+        Raises NotReady where connections hold on to too many others.
+        """
         replaced = self._active.get(serving.name)
+        if replaced is None or replaced.n_connections:
+            self._check_place()
         self._active[serving.name] = serving
         self._loaded.append(serving)
         if replaced is not None:
@@ -77,7 +89,13 @@ class Servings:
         n_bots = self.n_bots
         if n_bots + count > self._max_bots:
             raise TooManyBots(
-                f"{count} bots do not fit: {n_bots} of {self._max_bots} slots are taken", retry_after_s=1.0
+                f"{count} bots do not fit: {n_bots} of {self._max_bots} slots are taken", retry_after_s=_RETRY_AFTER_S
+            )
+
+    def _check_place(self) -> None:
+        if len(self._loaded) >= self._max_loaded:
+            raise NotReady(
+                f"connections hold all {self._max_loaded} bundles that may be in memory", retry_after_s=_RETRY_AFTER_S
             )
 
     def _forget_unused(self, serving: Serving) -> None:

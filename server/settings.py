@@ -10,6 +10,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from server.tokens import read_token
+
 __all__ = ["Settings"]
 
 _PROCESS = re.compile(r"[a-z0-9]{1,16}")
@@ -17,10 +19,16 @@ _PROCESS = re.compile(r"[a-z0-9]{1,16}")
 
 @dataclass(frozen=True)
 class Settings:
-    """Serve one bundle over HTTP and, where asked for, over TCP and a Unix socket."""
+    """Serve one bundle, or a store of them, over HTTP and, where asked for, over TCP and a Unix socket."""
 
-    bundle: Path
-    """Folder of the bundle to serve."""
+    bundle: Path | None = None
+    """Folder of the bundle to serve; or else:"""
+    store: Path | None = None
+    """Folder of bundles by name and version, NAME/VERSION/, of which one version of each name is active."""
+    signing_key: tuple[Path, ...] = ()
+    """Public keys (Ed25519, PEM), one of which must have signed a bundle for it to be served."""
+    max_loaded: int = 8
+    """Bundles in memory at any time: the active ones, and others that connections still hold."""
     host: str = "127.0.0.1"
     """Address to listen on, for HTTP and TCP."""
     port: int = 8000
@@ -47,7 +55,11 @@ class Settings:
     drain_s: float = 5.0
     """After SIGTERM, requests in progress have this long to finish."""
     token: str | None = None
-    """What Hello must carry. Required unless the host is a loopback address."""
+    """What Hello must carry. Required unless the host is a loopback address. Who lists processes can read it here."""
+    token_file: Path | None = None
+    """File of one line with that token, instead."""
+    admin_token_file: Path | None = None
+    """File of one line with the token that activating versions takes. Without it nobody can."""
     insecure_no_token: bool = False
     """Listen on other than loopback addresses without a token: for networks that only trusted machines are on."""
     process: str | None = None
@@ -57,8 +69,10 @@ class Settings:
     """Written once everything listens: JSON of the addresses (`http`, `tcp`, `unix`) and `pid`. Removed at the end."""
 
     def __post_init__(self) -> None:
-        if min(self.max_bots, self.max_connections, self.max_queue) < 1:
-            raise ValueError("max_bots, max_connections and max_queue must be at least 1")
+        if (self.bundle is None) == (self.store is None):
+            raise ValueError("give either a bundle or a store")
+        if min(self.max_bots, self.max_connections, self.max_queue, self.max_loaded) < 1:
+            raise ValueError("max_bots, max_connections, max_queue and max_loaded must be at least 1")
         if min(self.idle_ttl_s, self.frame_deadline_s, self.stuck_after_s, self.drain_s) <= 0:
             raise ValueError("idle_ttl_s, frame_deadline_s, stuck_after_s and drain_s must be positive")
         if not self.inline_us >= 0:
@@ -67,11 +81,19 @@ class Settings:
             raise ValueError(f"process {self.process[:80]!r} does not match {_PROCESS.pattern}")
         if self.token == "":
             raise ValueError("the token must not be empty")
-        if self.token is None and not self.insecure_no_token and not _is_loopback(self.host):
+        if self.token is not None and self.token_file is not None:
+            raise ValueError("give the token or its file, not both")
+        has_token = self.token is not None or self.token_file is not None
+        if not has_token and not self.insecure_no_token and not _is_loopback(self.host):
             raise ValueError(
                 f"refusing to listen on {self.host} without a token: anyone could take every bot. "
-                "Give --token, or --insecure-no-token if only trusted machines reach this network."
+                "Give --token-file, or --insecure-no-token if only trusted machines reach this network."
             )
+
+    def tokens(self) -> tuple[str | None, str | None]:
+        """The token of hellos and that of operators, None where there is none. Raises OSError, ValueError."""
+        token = self.token if self.token_file is None else read_token(self.token_file)
+        return token, None if self.admin_token_file is None else read_token(self.admin_token_file)
 
 
 def _is_loopback(host: str) -> bool:

@@ -39,7 +39,9 @@ class FakeClock:
 
 
 @contextmanager
-def serve(bundle: Path, uds: Path, clock: Callable[[], float] | None = None, **overrides: Any) -> Iterator[Served]:
+def serve(
+    bundle: Path | None, uds: Path, clock: Callable[[], float] | None = None, **overrides: Any
+) -> Iterator[Served]:
     settings = Settings(bundle=bundle, port=0, tcp_port=0, uds=uds, **overrides)
     started, failure = threading.Event(), []
     found: list[tuple[dict[str, str], asyncio.AbstractEventLoop, asyncio.Event]] = []
