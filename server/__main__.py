@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import os
 import signal
 import sys
@@ -18,11 +17,12 @@ import uvloop
 
 from protocol.errors import BadBundle
 from server.app import running
+from server.logs import configure, logger
 from server.settings import Settings
 
 __all__ = ["main"]
 
-_log = logging.getLogger("server")
+_log = logger("server")
 
 
 async def _serve(settings: Settings) -> None:
@@ -30,7 +30,7 @@ async def _serve(settings: Settings) -> None:
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(signal_number, stop.set)
     async with running(settings) as addresses:
-        _log.info("serving %s at %s", settings.bundle or settings.store, ", ".join(addresses.values()))
+        _log.info("serving", **addresses)
         try:
             if settings.ready_file is not None:
                 _write(settings.ready_file, {**addresses, "pid": os.getpid()})
@@ -50,12 +50,13 @@ def _write(path: Path, content: dict[str, str | int]) -> None:
 
 def main() -> None:
     """Parse the command line and serve. Exits with 2 for settings or a bundle that cannot be served."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    configure(None)
     try:
         settings = tyro.cli(Settings, description="Serve bundles to game engines.")
+        configure(settings.log_json)
         uvloop.run(_serve(settings))
     except (ValueError, BadBundle, OSError) as error:
-        _log.error("%s", error)
+        _log.error(str(error))
         sys.exit(2)
 
 

@@ -5,20 +5,20 @@ Every answered request passes here, with how and when it arrived. No exception l
 
 from __future__ import annotations
 
-import logging
 import time
 from typing import NamedTuple, Self
 
 from protocol import codec
 from protocol.codec import Format
 from protocol.errors import InternalError, ProtocolError
-from protocol.messages import Error, Reply, Request
+from protocol.messages import Error, Hello, Reply, Request, Welcome
 from server.handlers import Handlers
+from server.logs import digest, logger
 from server.recorder import Spans
 
 __all__ = ["Answer", "Arrival", "answer", "refusal"]
 
-_log = logging.getLogger(__name__)
+_log = logger(__name__)
 
 
 class Arrival(NamedTuple):
@@ -72,6 +72,9 @@ def answer(
         encoded_ns = clock()
         spans = Spans(wait_ns, decode_ns, encoded_ns - handled_ns, encoded_ns - arrival.received_ns)
         handlers.recorder.answered(arrival.transport, request, reply, spans)
+        if isinstance(reply, Welcome):
+            opened = digest(reply.connection)
+            _log.info("connection opened", transport=arrival.transport, connection=opened, bundle=reply.bundle)
         return Answer(reply, encoded, 200)
     except ProtocolError as error:
         refused = error
@@ -79,6 +82,8 @@ def answer(
         _log.exception("a request failed")
         refused = InternalError("the server failed to answer; its log says why")
     handlers.recorder.refused(arrival.transport, refused.code)
+    if kind is Hello or isinstance(sent, Hello):
+        _log.warning("hello refused", transport=arrival.transport, code=refused.code)
     return refusal(refused, reply_form)
 
 

@@ -35,12 +35,15 @@ from protocol.messages import (
     Welcome,
 )
 from server.connections import Connection, Connections
+from server.logs import digest, logger
 from server.recorder import Recorder
 from server.serving import Serving
 from server.servings import Servings
 from server.tokens import check
 
 __all__ = ["Handlers"]
+
+_log = logger(__name__)
 
 
 class Handlers:
@@ -77,19 +80,19 @@ class Handlers:
             case StopBots():
                 return self._stop_bots(request, connection)
             case Goodbye():
-                self.end(connection.id)
+                self.end(connection.id, "goodbye")
                 return Farewell()
 
-    def end(self, connection_id: str) -> None:
+    def end(self, connection_id: str, why: str = "socket closed") -> None:
         """End a connection and its bots; one that has ended already is no error."""
         connection = self._connections.remove(connection_id)
         if connection is not None:
-            self._let_go(connection)
+            self._let_go(connection, why)
 
     def end_silent(self) -> None:
         """End every connection that has been silent for longer than its time to live."""
         for connection in self._connections.remove_silent():
-            self._let_go(connection)
+            self._let_go(connection, "silence")
 
     def costs(self) -> list[Report]:
         """What acquiring costs each connection's engine, in the order in which they connected."""
@@ -202,8 +205,9 @@ class Handlers:
         connection.bots.difference_update(handles)
         return stopped
 
-    def _let_go(self, connection: Connection) -> None:
+    def _let_go(self, connection: Connection, why: str) -> None:
         """Stop what a connection that is gone has left."""
+        _log.info("connection ended", connection=digest(connection.id), bots=len(connection.bots), why=why)
         self._stop(connection, list(connection.bots))
         self.servings.release(connection.serving)
 

@@ -10,11 +10,13 @@ from collections.abc import Iterator
 
 from protocol.codec import Format
 from protocol.errors import NoBundle, NotReady, TooManyBots
+from server.logs import logger
 from server.serving import Serving
 
 __all__ = ["Servings"]
 
 _RETRY_AFTER_S = 1.0
+_log = logger(__name__)
 
 
 class Servings:
@@ -71,6 +73,7 @@ class Servings:
             self._check_place()
         self._active[serving.name] = serving
         self._loaded.append(serving)
+        _log.info("bundle active", bundle=serving.name, version=serving.version, sha256=serving.sha256)
         if replaced is not None:
             self._forget_unused(replaced)
         self._limit_bodies()

@@ -65,6 +65,8 @@ class Settings:
     process: str | None = None
     """Name of this process among several behind one front, lower-case letters and digits: connections' names begin with
     it, so that the front knows where each of them is held."""
+    log_json: bool | None = None
+    """Log lines of JSON, or of text; by default JSON unless a terminal is watching."""
     ready_file: Path | None = None
     """Written once everything listens: JSON of the addresses (`http`, `tcp`, `unix`) and `pid`. Removed at the end."""
 

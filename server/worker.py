@@ -7,7 +7,6 @@ loop while `is_idle`: never both, so nothing there needs a lock.
 from __future__ import annotations
 
 import asyncio
-import logging
 import queue
 import threading
 import time
@@ -15,11 +14,12 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from protocol.errors import NotReady
+from server.logs import logger
 
 __all__ = ["Worker"]
 
 T = TypeVar("T")
-_log = logging.getLogger(__name__)
+_log = logger(__name__)
 
 
 class Worker:
