@@ -28,7 +28,7 @@ PR_SET_PDEATHSIG = 1
 ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 if os.getppid() != int(sys.argv.pop(1)):
     sys.exit("the parent died before it could be watched")
-runpy.run_module("server", run_name="__main__", alter_sys=True)
+runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
 """
 
 
@@ -43,16 +43,16 @@ class ServerProcess:
     sends it SIGTERM when this process dies in any way, kill -9 included; elsewhere kill -9 leaves it running.
     """
 
-    def __init__(self, bundle: Path, *arguments: str) -> None:
-        """`arguments` go to the server's command line as they are."""
-        self._bundle, self._arguments = bundle, arguments
+    def __init__(self, bundle: Path, *arguments: str, module: str = "server") -> None:
+        """`arguments` go to the server's command line as they are. `module` is what is run, with that command line."""
+        self._bundle, self._arguments, self._module = bundle, arguments, module
 
     def __enter__(self) -> Self:
         self._folder = tempfile.TemporaryDirectory(prefix="bots-")
         self._ready_file = Path(self._folder.name) / "ready.json"
         self._log = Path(self._folder.name) / "server.log"
         command = [
-            *_command(), "--bundle", str(self._bundle), "--port", "0",
+            *_command(self._module), "--bundle", str(self._bundle), "--port", "0",
             "--uds", str(self._ready_file.with_name("s")), "--ready-file", str(self._ready_file), *self._arguments,
         ]  # fmt: skip
         with self._log.open("wb") as log:
@@ -106,11 +106,11 @@ class ServerProcess:
         return "\n".join(self._log.read_text(encoding="utf-8", errors="replace").splitlines()[-_TAIL_LINES:])
 
 
-def _command() -> list[str]:
-    """`python -m server`, on Linux by way of asking the kernel for SIGTERM at the parent's death (prctl(2)).
+def _command(module: str) -> list[str]:
+    """`python -m MODULE`, on Linux by way of asking the kernel for SIGTERM at the parent's death (prctl(2)).
 
     The child asks for itself: code between fork and exec (`preexec_fn`) may deadlock when the parent has threads.
     """
     if not sys.platform.startswith("linux"):
-        return [sys.executable, "-m", "server"]
-    return [sys.executable, "-c", _SERVE_UNTIL_PARENT_DIES, str(os.getpid())]
+        return [sys.executable, "-m", module]
+    return [sys.executable, "-c", _SERVE_UNTIL_PARENT_DIES, str(os.getpid()), module]
