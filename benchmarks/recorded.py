@@ -36,7 +36,7 @@ class RecordedFrames:
         return self._free_TF[self._rows(frame)]
 
     def costly(self, frame: int) -> NDArray[np.float32]:
-        """All costly numbers [N, D] of a frame, zero where they were not recorded."""
+        """All costly numbers [N, D] of a frame."""
         return self._costly_TD[self._rows(frame)]
 
     def known(self, frame: int, query_NM: NDArray[np.bool_]) -> NDArray[np.float32]:
