@@ -1,4 +1,4 @@
-"""Ways to carry one request's bytes to a server and one reply's bytes back: HTTP, TCP and Unix sockets, all blocking.
+"""Ways to carry one request's bytes to a server and one reply's bytes back, all blocking: HTTP, TCP, Unix sockets.
 
 This module knows nothing about what the bytes say. A transport opens its socket when it is first needed, and closes it
 after any failure: a late answer must never be read as the answer to the next request.
@@ -25,6 +25,7 @@ ROUTES = {
     "stop_bots": "/v1/bots/stop",
     "goodbye": "/v1/connections/close",
 }
+SOCKET_PATH = "/v1/socket"
 _REPEATABLE = {
     "request_queries",
     "submit_features",
@@ -48,15 +49,28 @@ class Transport(Protocol):
 
 
 def open_transport(url: str, timeout_s: float) -> Transport:
-    """The transport for `http://host:port`, `tcp://host:port` or `unix:///path`; raises ValueError for other URLs."""
+    """The transport for `http://host:port`, `ws://host:port`, `tcp://host:port` or `unix:///path`.
+
+    Raises ValueError for other URLs, ImportError where WebSockets need a package that is not installed.
+    """
     parts = urlsplit(url)
     if parts.scheme == "unix" and parts.path and not parts.netloc:
         return StreamTransport(parts.path, timeout_s)
+    if parts.scheme == "ws" and parts.hostname and parts.port and parts.path in ("", "/", SOCKET_PATH):
+        return _web_socket(parts.hostname, parts.port, timeout_s)
     if parts.scheme in ("http", "tcp") and parts.hostname and parts.port and parts.path in ("", "/"):
         if parts.scheme == "http":
             return HttpTransport(parts.hostname, parts.port, timeout_s)
         return StreamTransport((parts.hostname, parts.port), timeout_s)
-    raise ValueError(f"{url!r} is none of http://host:port, tcp://host:port, unix:///path")
+    raise ValueError(f"{url!r} is none of http://host:port, ws://host:port, tcp://host:port, unix:///path")
+
+
+def _web_socket(host: str, port: int, timeout_s: float) -> Transport:
+    try:
+        from protocol.websocket import WebSocketTransport
+    except ImportError as error:  # the only transport that needs a package
+        raise ImportError("ws:// needs the package `websockets`: install the extra `server`, or it alone") from error
+    return WebSocketTransport(host, port, SOCKET_PATH, timeout_s)
 
 
 class HttpTransport:

@@ -11,11 +11,13 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from functools import partial
+from typing import Any
 
 import uvicorn
 
 from bot_runtime.bundle import Bundle
 from bot_runtime.signature import Keys
+from protocol.transport import SOCKET_PATH
 from server.admin import AdminDoor, add_routes
 from server.catalogue import Catalogue
 from server.connections import Connections
@@ -32,6 +34,7 @@ from server.settings import Settings
 from server.sockets import Sockets
 from server.store import Store
 from server.stream import StreamSocket
+from server.websocket import web_socket
 from server.worker import Worker
 
 __all__ = ["running"]
@@ -41,7 +44,7 @@ _BACKLOG = 512
 
 @asynccontextmanager
 async def running(settings: Settings, *, clock: Callable[[], float] = time.monotonic) -> AsyncIterator[dict[str, str]]:
-    """Serve inside the `async with`; yields the addresses by door: `http`, `tcp`, `unix`.
+    """Serve inside the `async with`; yields the addresses by door: `http`, `ws`, `tcp`, `unix`.
 
     On leaving it is not ready at once, closes idle sockets, answers what is in progress for at most `drain_s`, and
     leaves no thread, socket or file behind. `clock` is what connections age by. Raises BadBundle, OSError.
@@ -65,8 +68,15 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
         rest = create_app(HttpDoor(handlers, worker), Probes(handlers, readiness, metrics))
         add_routes(rest, admin)
         application = Exchange(desk, rest, body_deadline_s=settings.frame_deadline_s)
-        uvicorn_server, http_address = await stack.enter_async_context(_http(settings, application))
-        addresses = {"http": http_address, **await stack.enter_async_context(_streams(settings, sockets))}
+        uvicorn_server, http_address = await stack.enter_async_context(
+            _http(settings, application, web_socket(sockets, settings.ws_origins))
+        )
+        ws_address = http_address.replace("http://", "ws://") + SOCKET_PATH
+        addresses = {
+            "http": http_address,
+            "ws": ws_address,
+            **await stack.enter_async_context(_streams(settings, sockets)),
+        }
         await stack.enter_async_context(_sweeping(handlers, worker, settings.idle_ttl_s / 4))
         try:
             yield addresses
@@ -98,13 +108,15 @@ class _Uvicorn(uvicorn.Server):
 
 
 @asynccontextmanager
-async def _http(settings: Settings, application: Exchange) -> AsyncIterator[tuple[uvicorn.Server, str]]:
+async def _http(
+    settings: Settings, application: Exchange, socket_protocol: Any
+) -> AsyncIterator[tuple[uvicorn.Server, str]]:
     listening = _listen(settings.host, settings.port)
     server = _Uvicorn(
         uvicorn.Config(
             application,
             http=prompt_http(settings.frame_deadline_s),
-            ws="none",
+            ws=socket_protocol,
             lifespan="off",
             log_config=None,
             access_log=False,

@@ -11,7 +11,7 @@ from abc import abstractmethod
 from typing import cast
 
 from protocol.codec import Format
-from protocol.errors import ProtocolError, TooLarge, TooManyConnections
+from protocol.errors import TooManyConnections
 from protocol.messages import Farewell, Welcome
 from server.answer import Answer, Arrival, refusal
 from server.sockets import Sockets
@@ -42,7 +42,7 @@ class Conversation(asyncio.Protocol):
 
     @abstractmethod
     def _next(self) -> bytes | None:
-        """The next whole request's body, if it is all there. Raises TooLarge."""
+        """The next whole request's body, if it is all there; one that is too large is refused here."""
 
     @property
     @abstractmethod
@@ -52,10 +52,6 @@ class Conversation(asyncio.Protocol):
     @abstractmethod
     def _framed(self, body: bytes) -> bytes:
         """A reply as it travels."""
-
-    @abstractmethod
-    def _refuse(self, error: ProtocolError) -> None:
-        """Say why this cannot go on, as the last thing said."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See asyncio.Protocol."""
@@ -102,6 +98,7 @@ class Conversation(asyncio.Protocol):
         """See asyncio.Protocol."""
         self._is_stuck = False
         if not (self.is_busy or self._is_over):
+            self._rest()
             self._proceed()
 
     def finish(self) -> None:
@@ -114,11 +111,8 @@ class Conversation(asyncio.Protocol):
 
     def _proceed(self) -> None:
         """Answer the next request, if it is all there."""
-        try:
-            body = self._next()
-        except TooLarge as error:
-            self._sockets.desk.handlers.recorder.refused(self.name, error.code)
-            self._refuse(error)
+        body = None if self._is_over else self._next()
+        if self._is_over:
             return
         if body is None:
             self._wait()
@@ -143,16 +137,23 @@ class Conversation(asyncio.Protocol):
         self._transport.write(self._framed(answered.body))
         if isinstance(answered.reply, Farewell) or self._sockets.draining:
             self._close()
-        elif self._has_part and not self._is_stuck:
-            self.is_busy = True  # it is, in the next round of the event loop: other sockets have their turn first
-            self._loop.call_soon(self._go_on)
         elif not self._is_stuck:
-            self._wait()
+            self._rest()
+            if self._has_part:
+                self.is_busy = True  # it is, in the next round of the event loop: other sockets have their turn first
+                self._loop.call_soon(self._go_on)
+            else:
+                self._wait()
 
     def _go_on(self) -> None:
         self.is_busy = False
         if not (self._is_over or self._is_stuck):
             self._proceed()
+
+    def _rest(self) -> None:
+        """From now on, whatever comes that is no request, the time counts until the next one begins."""
+        is_known = self._connection is not None
+        self._expect(self._sockets.idle_ttl_s if is_known else self._sockets.frame_deadline_s)
 
     def _wait(self) -> None:
         """For the rest of a request, or for the next one."""
@@ -160,10 +161,7 @@ class Conversation(asyncio.Protocol):
             self._close()
             return
         self._read_on()
-        if not self._has_part:
-            is_known = self._connection is not None
-            self._expect(self._sockets.idle_ttl_s if is_known else self._sockets.frame_deadline_s)
-        elif not self._is_begun:
+        if self._has_part and not self._is_begun:
             self._is_begun = True
             self._expect(self._sockets.frame_deadline_s)
 
@@ -176,6 +174,16 @@ class Conversation(asyncio.Protocol):
         """Close, giving what was written a last chance to leave."""
         self._is_over = True
         self._transport.close()
+        self._expect(self._sockets.frame_deadline_s)
+
+    def _end(self) -> None:
+        """The last word has been written. Read on without looking until the client closes, within the deadline.
+
+        Closing while the client is still sending would reset the socket, and what was written would be lost.
+        """
+        self._is_over = True
+        self._read_on()
+        self._transport.write_eof()
         self._expect(self._sockets.frame_deadline_s)
 
     def _expect(self, within_s: float) -> None:

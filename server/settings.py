@@ -19,7 +19,7 @@ _PROCESS = re.compile(r"[a-z0-9]{1,16}")
 
 @dataclass(frozen=True)
 class Settings:
-    """Serve one bundle, or a store of them, over HTTP and, where asked for, over TCP and a Unix socket."""
+    """Serve one bundle, or a store of them, over HTTP, WebSockets and, where asked for, TCP and a Unix socket."""
 
     bundle: Path | None = None
     """Folder of the bundle to serve; or else:"""
@@ -33,6 +33,9 @@ class Settings:
     """Address to listen on, for HTTP and TCP."""
     port: int = 8000
     """HTTP port; 0 lets the system pick one (see ready-file)."""
+    ws_origins: tuple[str, ...] = ()
+    """Web pages that may open WebSockets, as browsers name them: `https://example.org`. Other pages may not; clients
+    that are no browsers are not asked."""
     tcp_port: int | None = None
     """Port of the length-prefixed stream; 0 lets the system pick one. Not served unless given."""
     uds: Path | None = None
@@ -68,7 +71,8 @@ class Settings:
     log_json: bool | None = None
     """Log lines of JSON, or of text; by default JSON unless a terminal is watching."""
     ready_file: Path | None = None
-    """Written once everything listens: JSON of the addresses (`http`, `tcp`, `unix`) and `pid`. Removed at the end."""
+    """Written once everything listens: JSON of the addresses (`http`, `ws`, `tcp`, `unix`) and `pid`. Removed at the
+    end."""
 
     def __post_init__(self) -> None:
         if (self.bundle is None) == (self.store is None):

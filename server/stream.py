@@ -40,7 +40,8 @@ class StreamSocket(Conversation):
         (size,) = _PREFIX.unpack_from(buffer)
         limit = self._sockets.desk.handlers.max_body_bytes[Format.MSGPACK]
         if size > limit:
-            raise TooLarge(f"the frame has {size} bytes, the limit is {limit}")
+            self._refuse(TooLarge(f"the frame has {size} bytes, the limit is {limit}"))
+            return None
         end = _PREFIX.size + size
         if len(buffer) < end:
             return None
@@ -55,9 +56,6 @@ class StreamSocket(Conversation):
         return _PREFIX.pack(len(body)) + body
 
     def _refuse(self, error: ProtocolError) -> None:
-        """Reads on without looking, so that this is not lost to a reset while the client is still sending."""
-        self._is_over = True
-        self._read_on()
+        self._sockets.desk.handlers.recorder.refused(self.name, error.code)
         self._transport.write(self._framed(refusal(error, Format.MSGPACK).body))
-        self._transport.write_eof()
-        self._expect(self._sockets.frame_deadline_s)
+        self._end()

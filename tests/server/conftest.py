@@ -32,7 +32,7 @@ def served(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
         yield running
 
 
-@pytest.fixture(params=["http", "tcp", "unix"])
+@pytest.fixture(params=["http", "tcp", "unix", "ws"])
 def client(request: pytest.FixtureRequest, served: Served) -> Iterator[BotClient]:
     """A client that has said hello, by each door."""
     with BotClient(served.addresses[request.param]) as connected:

@@ -40,7 +40,7 @@ def test_a_refusal_is_bounded_and_says_when_to_try_again() -> None:
     assert (answered.status, said["retry_after_s"], len(said["detail"])) == (429, 2.0, MAX_DETAIL_CHARS)
 
 
-@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_every_request_says_by_which_door_and_when_it_came(
     served: Served, door: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

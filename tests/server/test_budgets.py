@@ -35,7 +35,7 @@ def test_without_a_limit_the_budget_is_what_everything_costs_on_this_connection(
         assert handlers.handle(hello, None, Format.MSGPACK).budget_us == full_us
 
 
-@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_costs_and_budgets_are_by_the_connections_own_cost_model(served: Served, door: str) -> None:
     """Two engines at once whose rays cost differently, the second one's ten times the first one's."""
     models = [CostModel(3.0 * k, tuple((2.0 + i) * k for i in range(TABLE.n_queries))) for k in (1.0, 10.0)]
@@ -60,7 +60,7 @@ def test_a_cost_model_prices_every_costly_feature(served: Served) -> None:
         client.hello(cost_model=CostModel(0.0, (1.0,)))
 
 
-@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_a_budget_of_the_frame_is_shared_by_the_messages_bots(served: Served, door: str) -> None:
     with BotClient(served.addresses[door]) as client:
         client.hello()

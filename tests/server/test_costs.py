@@ -34,7 +34,7 @@ def play(client: BotClient, bots: np.ndarray, frames: range, us_per_declared_us:
     return np.array(spent_us)
 
 
-@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_a_connections_budgets_are_kept_by_its_own_measurements(served: Served, door: str) -> None:
     """Two engines at once: the rays of one cost three times what is declared, the other says nothing."""
     with BotClient(served.addresses[door]) as measuring, BotClient(served.addresses[door]) as silent:

@@ -30,7 +30,7 @@ def test_another_connections_bots_look_like_none_at_all(client: BotClient, serve
     bots = client.start(2, seeds=[1, 2])
     played = play(client, TABLE, bots, range(3))
     free, costly = free_numbers(TABLE, 2, 3), costly_numbers(TABLE, 2, 3)
-    for door in ("http", "tcp", "unix"):
+    for door in ("http", "tcp", "unix", "ws"):
         with BotClient(served.addresses[door]) as other:
             other.hello()
             own = other.start(1)
@@ -82,7 +82,7 @@ def test_connection_names_cannot_be_guessed(served: Served) -> None:
     assert all(len(name) == 32 and int(name, 16) >= 0 for name in names)
 
 
-@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_the_end_of_a_connection_frees_its_bots(served: Served, door: str) -> None:
     address = served.addresses[door]
     for _ in range(3):
@@ -136,7 +136,7 @@ def _starts(client: BotClient) -> bool:
 
 def test_tokens(bundle: Path, tmp_path: Path) -> None:
     with serve(bundle, tmp_path / "s", token="s3cret é") as served:
-        for door in ("http", "tcp", "unix"):
+        for door in ("http", "tcp", "unix", "ws"):
             with BotClient(served.addresses[door]) as client:
                 for token in (None, "", "s3cret", "s3cret é "):
                     with pytest.raises(Unauthorized):

@@ -22,7 +22,7 @@ from tests.server.serving import Served, costly_numbers, free_numbers, http_requ
 N = 3
 SEEDS = [5, 6, 7]
 MODEL = CostModel(5.0, tuple(2.0 + i for i in range(TABLE.n_queries)))  # 70 µs in all
-DOORS = ["http", "tcp", "unix"]
+DOORS = ["http", "tcp", "unix", "ws"]
 
 
 def _serve(folder: Path, **kind: object) -> Iterator[tuple[Served, Bundle]]:

@@ -41,7 +41,7 @@ def server(bundle: Path, tmp_path: Path) -> Served:
         yield running
 
 
-@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_what_happened_is_what_it_says(server: Served, door: str) -> None:
     with BotClient(server.addresses[door]) as client:
         client.hello()

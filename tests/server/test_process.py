@@ -42,7 +42,7 @@ def process(bundle: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str],
 def test_a_signal_ends_it_with_0_and_nothing_left(bundle: Path, tmp_path: Path, number: signal.Signals) -> None:
     with process(bundle, tmp_path) as (server, addresses):
         assert addresses["pid"] == server.pid
-        clients = [BotClient(addresses[door]) for door in ("http", "tcp", "unix")]
+        clients = [BotClient(addresses[door]) for door in ("http", "tcp", "unix", "ws")]
         for client in clients:
             client.hello()
             play(client, TABLE, client.start(1), range(2))

@@ -74,7 +74,7 @@ class Raw:
         return self.transport.exchange(message["type"], msgpack.packb(message), self.connection)
 
 
-@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_retries_get_the_same_bytes_and_advance_nothing(served: Served, door: str) -> None:
     raw = Raw(served.addresses[door])
     bots = raw.ask({"type": "start_bots", "count": 2, "seeds": [1, 2]})["bots"]
