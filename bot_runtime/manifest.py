@@ -13,12 +13,21 @@ import msgspec
 
 from protocol.features import ActionSpec, FeatureTable
 
-__all__ = ["FILES", "MAX_CONTEXT_LENGTH", "MAX_TOLERANCE", "SCHEMA_VERSION", "FileEntry", "Manifest"]
+__all__ = [
+    "FILES",
+    "MAX_CONTEXT_LENGTH",
+    "MAX_INT8_TOLERANCE",
+    "MAX_TOLERANCE",
+    "SCHEMA_VERSION",
+    "FileEntry",
+    "Manifest",
+]
 
 SCHEMA_VERSION = 2
 FILES = ("acquisition.onnx", "action.onnx", "golden.npz")
 MAX_CONTEXT_LENGTH = 1024
 MAX_TOLERANCE = 1e-2
+MAX_INT8_TOLERANCE = 0.1  # where a last digit, rounded another way, is a whole step
 _MAX_DIMENSION = 65536
 _MAX_CONTEXT_NUMBERS = 16 * 2**20  # keys and values of one bot: 64 MiB
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
@@ -45,7 +54,8 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     all: a network without memory, whose layers, heads and width are 0. `prepared_width` is how many numbers the
     acquisition graph hands on to the action graph, `samples_action` says that the latter reads noise. `target_cost` is
     the share of the full cost that a budget-conditioned network is asked for by default; None, and the network has no
-    such input. `tolerance` is the largest |Δ| that the golden replay accepts.
+    such input. `tolerance` is the largest |Δ| that the golden replay accepts. `precision` is that of the graphs' large
+    matrix products.
     """
 
     schema_version: Literal[2]
@@ -66,6 +76,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     files: dict[str, FileEntry]
     provenance: dict[str, str]
     target_cost: float | None = None
+    precision: Literal["fp32", "int8"] = "fp32"
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -77,8 +88,9 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"budget is {self.budget}, expected 0 to 1")
         if self.target_cost is not None and not 0.0 <= self.target_cost <= 1.0:
             raise ValueError(f"target_cost is {self.target_cost}, expected 0 to 1 or null")
-        if not 0.0 < self.tolerance <= MAX_TOLERANCE:
-            raise ValueError(f"tolerance is {self.tolerance}, expected more than 0 and at most {MAX_TOLERANCE}")
+        most = MAX_INT8_TOLERANCE if self.precision == "int8" else MAX_TOLERANCE
+        if not 0.0 < self.tolerance <= most:
+            raise ValueError(f"tolerance is {self.tolerance}, expected more than 0 and at most {most}")
         if set(self.files) != set(FILES):
             raise ValueError(f"files are {sorted(self.files)}, expected {sorted(FILES)}")
 

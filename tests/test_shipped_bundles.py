@@ -16,13 +16,13 @@ from training.evaluate import EvaluateConfig, evaluate
 BUNDLES = Path(__file__).parent.parent / "bundles"
 
 
-@pytest.mark.parametrize("name", ["easy", "hard"])
-def test_verifies_and_is_made_for_this_game(name: str) -> None:
+@pytest.mark.parametrize(("name", "precision"), [("easy", "fp32"), ("hard", "fp32"), ("hard-int8", "int8")])
+def test_verifies_and_is_made_for_this_game(name: str, precision: str) -> None:
     manifest = Bundle.load(BUNDLES / name).manifest
-    assert manifest.name == name
+    assert (manifest.name, manifest.precision) == (name, precision)
     assert manifest.features == feature_table()
     assert manifest.action == ACTION_SPEC
-    assert manifest.provenance["environment"] == f"game.env:Navigation-{name}-v0"
+    assert manifest.provenance["environment"] == f"game.env:Navigation-{name.removesuffix('-int8')}-v0"
 
 
 @pytest.mark.parametrize("name", ["easy", "hard"])
@@ -39,6 +39,17 @@ def test_recorded_evaluation_meets_the_bar(name: str) -> None:
     full = json.loads((BUNDLES / name / "full_features.json").read_text())
     assert recorded["episodes"] == full["episodes"] == len(recorded["returns"]) == 256
     assert recorded["return_mean"] >= 0.9 * full["return_mean"]
+    assert recorded["hard_cost_pct"] <= 20.0
+    assert recorded["violations"] == 0
+
+
+def test_int8_is_of_the_bundle_beside_it_and_loses_at_most_a_hundredth() -> None:
+    recorded = json.loads((BUNDLES / "hard-int8" / "evaluation.json").read_text())
+    report = json.loads((BUNDLES / "hard-int8" / "int8.json").read_text())
+    assert report["source_sha256"] == Bundle.load(BUNDLES / "hard").sha256
+    before = json.loads((BUNDLES / "hard" / "evaluation.json").read_text())
+    assert (recorded["episodes"], recorded["seed"]) == (before["episodes"], before["seed"])
+    assert recorded["return_mean"] == report["returns"]["int8_mean"] >= 0.99 * before["return_mean"]
     assert recorded["hard_cost_pct"] <= 20.0
     assert recorded["violations"] == 0
 

@@ -3,32 +3,32 @@
 Writes acquisition.onnx, action.onnx, golden.npz and manifest.json, then loads the bundle with the runtime's own loader,
 which replays the golden episode: a bundle that leaves here has passed the check that a server makes. The files that
 made it (config.json, versions.json, metrics.jsonl) are copied beside it, with the training curves as a picture.
+
+`--int8` goes from a bundle to another (`training.int8`): `python -m training.export bundles/hard out/hard-int8 --int8`.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import torch
 import tyro
 from rich.console import Console
 
 from bot_runtime.bundle import Bundle
-from bot_runtime.manifest import FILES, SCHEMA_VERSION, FileEntry, Manifest
+from bot_runtime.manifest import SCHEMA_VERSION, Manifest
 from bot_runtime.noise import uniforms
 from training.acquisition import rollout, sample_queries
+from training.bundle_folder import file_entries, new_folder, write_manifest
 from training.checkpoint import Trained, load_trained
 from training.config import TrainConfig
 from training.curves import plot_curves
 from training.feature_map import FEATURE_MAP
 from training.graphs import acquisition_graph, action_graph, reads_noise
+from training.int8 import Int8, export_int8, report_lines
 from training.policy import ModelConfig
 
 __all__ = ["ExportConfig", "export", "golden_episode", "write_graphs"]
@@ -40,10 +40,14 @@ _COPIED = ("config.json", "versions.json", "metrics.jsonl")
 class ExportConfig:
     """What to export, and where to."""
 
-    run: tyro.conf.Positional[Path]  # folder written by training.train
+    run: tyro.conf.Positional[Path]  # folder written by training.train; with --int8 one of a bundle
     out: tyro.conf.Positional[Path]  # folder of the bundle; replaced if it exists
     name: str = ""  # of the bundle (empty: the run's)
-    tolerance: float = 1e-4  # largest |Δ| between torch and ONNX that is accepted
+    tolerance: float = 1e-4  # largest |Δ| between torch and ONNX that is accepted; int8 finds its own
+    int8: bool = False  # large matrix products in int8
+    episodes: int = 0  # with --int8: so many episodes of either bundle, for their returns
+    environment: str = ""  # of these episodes (empty: the one that the bundle names)
+    seed: int = 1_000_000  # of the first of them
 
 
 def write_graphs(trained: Trained, folder: Path) -> None:
@@ -86,32 +90,21 @@ def golden_episode(trained: Trained, seed: int = 0) -> dict[str, np.ndarray]:
 def export(config: ExportConfig) -> Bundle:
     """Write the bundle, verify it, put it in place; an existing bundle is replaced only by one that verified."""
     trained = load_trained(config.run / "checkpoint.pt")
-    config.out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=config.out.parent, prefix=".export-") as scratch:
-        folder = Path(scratch) / config.out.name
-        folder.mkdir()
+    with new_folder(config.out) as folder:
         write_graphs(trained, folder)
         np.savez_compressed(folder / "golden.npz", **golden_episode(trained))
-        manifest = _manifest(trained, folder, config)
-        (folder / "manifest.json").write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+        write_manifest(folder, _manifest(trained, folder, config))
         bundle = Bundle.load(folder)
         for name in _COPIED:
             shutil.copy(config.run / name, folder / name)
         if trained.facts.feature_map is not None:
             trained.facts.feature_map.write(folder / FEATURE_MAP)
         plot_curves(folder / "metrics.jsonl", folder / "curves.png", trained.config)
-        if config.out.exists():
-            shutil.rmtree(config.out)
-        os.replace(folder, config.out)
     return bundle
 
 
 def _manifest(trained: Trained, folder: Path, asked: ExportConfig) -> Manifest:
     config, facts, sizes = trained.config, trained.facts, trained.model.config
-    files = {}
-    for name in FILES:
-        data = (folder / name).read_bytes()
-        files[name] = FileEntry(sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
     return Manifest(
         schema_version=SCHEMA_VERSION,
         name=asked.name or config.name,
@@ -125,7 +118,7 @@ def _manifest(trained: Trained, folder: Path, asked: ExportConfig) -> Manifest:
         samples_action=reads_noise(trained.model),
         budget=config.frame_budget,
         tolerance=asked.tolerance,
-        files=files,
+        files=file_entries(folder),
         provenance={
             "dataset": config.dataset_name,
             "environment": config.environment,
@@ -154,9 +147,17 @@ def _context_sizes(sizes: ModelConfig) -> dict[str, int]:
 
 def main() -> None:
     """Command line."""
-    bundle = export(tyro.cli(ExportConfig, description=__doc__))
+    config, console = tyro.cli(ExportConfig, description=__doc__), Console()
+    if config.int8:
+        bundle, report = export_int8(
+            Int8(config.run, config.out, config.name, config.episodes, config.environment, config.seed)
+        )
+        for line in report_lines(report):
+            console.print(line)
+    else:
+        bundle = export(config)
     manifest = bundle.manifest
-    Console().print(f"bundle {manifest.name}: verified, {sum(file.bytes for file in manifest.files.values()):,} bytes")
+    console.print(f"bundle {manifest.name}: verified, {sum(file.bytes for file in manifest.files.values()):,} bytes")
 
 
 if __name__ == "__main__":

@@ -101,6 +101,9 @@ def test_missing_linked_or_not_a_file(copy: Path, file: str) -> None:
         {"budget": None},
         {"tolerance": 1.0},
         {"tolerance": 0.0},
+        {"tolerance": 0.05},
+        {"tolerance": 0.2, "precision": "int8"},
+        {"precision": "int4"},
         {"files": {}},
         {"files": {"../x": {"sha256": "0" * 64, "bytes": 1}}},
         {"files": {file: {"sha256": "xyz", "bytes": 1} for file in FILES}},
@@ -116,6 +119,15 @@ def test_illegal_manifest(copy: Path, fields: dict[str, object]) -> None:
     change_manifest(copy, **fields)
     with pytest.raises(BadBundle, match=r"manifest\.json"):
         Bundle.load(copy)
+
+
+def test_a_manifest_that_says_nothing_of_precision_is_float32(copy: Path) -> None:
+    manifest = msgspec.json.decode((copy / "manifest.json").read_bytes())
+    del manifest["precision"]
+    (copy / "manifest.json").write_bytes(msgspec.json.encode(manifest))
+    assert Bundle.load(copy).manifest.precision == "fp32"
+    change_manifest(copy, tolerance=0.05, precision="int8")
+    assert Bundle.load(copy).manifest.precision == "int8"
 
 
 def test_a_bundle_of_an_earlier_schema_says_what_to_do(copy: Path) -> None:
