@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from bot_runtime.bundle import MANIFEST_FILE
+from bot_runtime.contents import MANIFEST_FILE
 from bot_runtime.manifest import FILES, FileEntry, Manifest
 
 __all__ = ["file_entries", "new_folder", "write_manifest"]
