@@ -11,11 +11,11 @@ import logging
 import math
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
 import msgspec
 from fastapi import FastAPI
-from msgspec import Meta, Struct
+from msgspec import Struct
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
@@ -34,35 +34,19 @@ from protocol.errors import (
 from server.answer import refusal
 from server.catalogue import Catalogue
 from server.handlers import Handlers
-from server.listing import in_memory, listing
+from server.listing import Activate, Rollback, in_memory, listing
+from server.openapi import ADMIN_ROUTES
 from server.store import Record
 from server.tokens import bearer, check
 from server.worker import Worker
 
-__all__ = ["ADMIN_ROUTES", "Activate", "AdminDoor", "Rollback", "add_routes"]
+__all__ = ["AdminDoor", "add_routes"]
 
 _MAX_BODY_BYTES = 4096
 _BODY_S = 3.0
 _JSON = Format.JSON.value
 _log = logging.getLogger(__name__)
 T = TypeVar("T", bound=Struct)
-
-
-class Activate(Struct, forbid_unknown_fields=True):
-    """Make this version active. `sha256`, where given, is what its manifest must have."""
-
-    version: Annotated[int, Meta(ge=1, le=999_999_999)]
-    sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")] | None = None
-
-
-class Rollback(Struct, forbid_unknown_fields=True):
-    """Make active what was active before."""
-
-
-ADMIN_ROUTES: dict[str, type[Struct]] = {
-    "/v1/bundles/{name}/activate": Activate,
-    "/v1/bundles/{name}/rollback": Rollback,
-}
 
 
 class AdminDoor:

@@ -7,7 +7,6 @@ another process, and only the exchange of one serving for another to the worker,
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
@@ -16,6 +15,7 @@ from pathlib import Path
 from bot_runtime.bundle import Bundle
 from bot_runtime.signature import Keys
 from protocol.errors import BadBundle, NoBundle, NotReady, ProtocolError
+from server.logs import logger
 from server.serving import Serving
 from server.servings import Servings
 from server.store import Content, Record, Store
@@ -25,7 +25,7 @@ from server.worker import Worker
 __all__ = ["Catalogue"]
 
 _MAX_VERIFIED = 256
-_log = logging.getLogger(__name__)
+_log = logger(__name__)
 
 
 class Catalogue:
@@ -61,7 +61,6 @@ class Catalogue:
             self._servings.activate(Serving(bundle, max_bots=self._max_bots, version=version))
             if record is None:
                 self.store.write(name, Record(Content(version, bundle.sha256)))
-            _log.info("serving %s version %d", name, version)
         if not list(self._servings):
             raise ValueError("the store is empty: expected NAME/VERSION/manifest.json in it")
 
@@ -101,7 +100,7 @@ class Catalogue:
         try:
             serving = await self._load(name, version, sha256)
         except BadBundle as error:
-            _log.warning("refused version %d of %s: %s", version, name, error.detail)
+            _log.warning("bundle refused", bundle=name, version=version, why=error.detail)
             raise
         changed = Record(Content(version, serving.sha256), None if record is None else record.active)
         # Recorded first: what cannot be recorded is not served, and what was recorded has been verified.
@@ -111,16 +110,16 @@ class Catalogue:
         except ProtocolError:
             await asyncio.to_thread(self.store.write, name, record)
             raise
-        _log.info("activated version %d of %s", version, name)
         return changed
 
     async def _load(self, name: str, version: int, sha256: str | None) -> Serving:
+        for serving in self._servings:
+            if (serving.name, serving.version) == (name, version):  # connections hold it still
+                _check(serving.bots.bundle, name, version, sha256)
+                return serving
         path = await asyncio.to_thread(self.store.path, name, version)
         bundle = await asyncio.to_thread(Bundle.read, path, keys=self._keys)
         _check(bundle, name, version, sha256)
-        for serving in self._servings:
-            if (serving.name, serving.version) == (name, version):
-                _check(bundle, name, version, serving.sha256)
         if bundle.sha256 not in self._verified:
             if await verify(path, self._key_paths) != bundle.sha256:
                 raise BadBundle(f"version {version} of {name} was changed while it was being verified")

@@ -1,32 +1,45 @@
-"""What `GET /v1/bundles` says: every bundle of the store and in memory, by name and version.
+"""What operators are told and may ask: every bundle of the store and in memory, by name and version.
 
 This module knows nothing about HTTP.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from protocol.errors import BadBundle, NoBundle
 from server.servings import Servings
 from server.store import Store
 
-__all__ = ["Listed", "Version", "in_memory", "listing"]
+__all__ = ["Activate", "Listed", "Rollback", "Version", "in_memory", "listing"]
+
+
+class Activate(Struct, forbid_unknown_fields=True):
+    """Make this version active. `sha256`, where given, is what its manifest must have."""
+
+    version: Annotated[int, Meta(ge=1, le=999_999_999)]
+    sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")] | None = None
+
+
+class Rollback(Struct, forbid_unknown_fields=True):
+    """Make active what was active before."""
 
 
 class Version(Struct):
     """One version. `sha256` is of its manifest, on disk where it is not in memory; null where that cannot be read.
 
     `active`: new connections get it. `held`: connections that have it keep it. `stored`: on disk; it is verified when
-    it is activated. `version` is null where the server has one folder and no store.
+    it is activated, and only then it is known who signed it, and its precision. `version` is null where the server has
+    one folder and no store.
     """
 
     version: int | None
     state: Literal["active", "held", "stored"]
     sha256: str | None
     signed_by: str | None = None
+    precision: str | None = None
     connections: int = 0
     bots: int = 0
 
@@ -53,6 +66,7 @@ def in_memory(servings: Servings) -> _Loaded:
             "active" if servings.active(serving.name) is serving else "held",
             serving.sha256,
             bundle.signed_by,
+            bundle.manifest.provenance.get("precision", "float32"),
             serving.n_connections,
             serving.bots.n_bots,
         )

@@ -15,8 +15,10 @@ from bot_runtime.manifest import Manifest
 from protocol import messages
 from protocol.codec import Format
 from protocol.errors import ERRORS_BY_CODE
+from server.listing import Activate, Listed, Rollback
+from server.store import Record
 
-__all__ = ["CONNECTION_HEADER", "ROUTES", "document", "summary"]
+__all__ = ["ADMIN_ROUTES", "CONNECTION_HEADER", "ROUTES", "document", "summary"]
 
 CONNECTION_HEADER = "X-Bot-Connection"
 ROUTES: dict[str, tuple[type[messages.Request], type[messages.Reply]]] = {
@@ -28,6 +30,10 @@ ROUTES: dict[str, tuple[type[messages.Request], type[messages.Reply]]] = {
     "/v1/bots/stop": (messages.StopBots, messages.BotsStopped),
     "/v1/connections/close": (messages.Goodbye, messages.Farewell),
 }
+ADMIN_ROUTES: dict[str, type[msgspec.Struct]] = {
+    "/v1/bundles/{name}/activate": Activate,
+    "/v1/bundles/{name}/rollback": Rollback,
+}
 _CONNECTION = {
     "name": CONNECTION_HEADER,
     "in": "header",
@@ -35,6 +41,14 @@ _CONNECTION = {
     "description": "The `connection` of Welcome.",
     "schema": {"type": "string"},
 }
+_NAME = {
+    "name": "name",
+    "in": "path",
+    "required": True,
+    "description": "A bundle's name.",
+    "schema": {"type": "string", "pattern": "^[a-z0-9][a-z0-9_-]{0,63}$"},
+}
+_BEARER: dict[str, list[str]] = {"bearer": []}
 _REF = "#/components/schemas/{name}"
 
 
@@ -46,7 +60,10 @@ def document(app: FastAPI) -> None:
     def openapi() -> dict[str, Any]:
         drawn = draw()
         drawn["paths"].update({path: {"post": _operation(*pair)} for path, pair in ROUTES.items()})
-        drawn.setdefault("components", {}).setdefault("schemas", {}).update(_schemas())
+        drawn["paths"].update(_admin_paths())
+        components = drawn.setdefault("components", {})
+        components.setdefault("schemas", {}).update(_schemas())
+        components["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
         return drawn
 
     app.openapi = openapi  # type: ignore[method-assign]  # FastAPI's documented way to extend the document
@@ -68,9 +85,39 @@ def _operation(request: type[messages.Request], reply: type[messages.Reply]) -> 
     }
 
 
+def _admin_paths() -> dict[str, Any]:
+    """What operators ask (`server.admin`): JSON alone, with a bearer token."""
+    paths: dict[str, Any] = {"/v1/bundles": {"get": _admin_operation("Bundles", "What there is to serve.", Listed)}}
+    paths["/v1/bundles"]["get"]["responses"]["200"]["content"] = _json({"type": "array", "items": _schema(Listed)})
+    for path, kind in ADMIN_ROUTES.items():
+        operation = _admin_operation(kind.__name__, str(kind.__doc__), Record)
+        operation["parameters"] = [_NAME]
+        operation["requestBody"] = {"required": True, "content": _json(_schema(kind))}
+        paths[path] = {"post": operation}
+    return paths
+
+
+def _admin_operation(summary: str, description: str, reply: type[msgspec.Struct]) -> dict[str, Any]:
+    statuses = sorted({error.status for error in ERRORS_BY_CODE.values()})
+    refused = {
+        str(status): {"description": _codes(status), "content": _json(_schema(messages.Error))} for status in statuses
+    }
+    answered = {"200": {"description": reply.__name__, "content": _json(_schema(reply))}}
+    return {"summary": summary, "description": description, "security": [_BEARER], "responses": answered | refused}
+
+
+def _schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
+    return {"$ref": _REF.format(name=kind.__name__)}
+
+
+def _json(schema: dict[str, Any]) -> dict[str, Any]:
+    return {Format.JSON.value: {"schema": schema}}
+
+
 def _schemas() -> dict[str, Any]:
     _, components = msgspec.json.schema_components(
-        [kind for pair in ROUTES.values() for kind in pair] + [messages.Error], ref_template=_REF
+        [kind for pair in ROUTES.values() for kind in pair] + [messages.Error, Listed, Record, *ADMIN_ROUTES.values()],
+        ref_template=_REF,
     )
     return components
 

@@ -66,13 +66,14 @@ class Servings:
     def activate(self, serving: Serving) -> None:
         """From now on new connections get this one where they would have got the one of the same name.
 
-        Raises NotReady where connections hold on to too many others.
+        It may be one that connections hold still. Raises NotReady where they hold on to too many others.
         """
         replaced = self._active.get(serving.name)
-        if replaced is None or replaced.n_connections:
-            self._check_place()
+        if serving not in self._loaded:
+            if replaced is None or replaced.n_connections:
+                self._check_place()
+            self._loaded.append(serving)
         self._active[serving.name] = serving
-        self._loaded.append(serving)
         _log.info("bundle active", bundle=serving.name, version=serving.version, sha256=serving.sha256)
         if replaced is not None:
             self._forget_unused(replaced)

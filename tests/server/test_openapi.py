@@ -24,7 +24,10 @@ def test_the_document_describes_every_message_route_in_both_formats(served: Serv
         assert {str(error.status) for error in ERRORS_BY_CODE.values()} <= set(operation["responses"])
     known = {f"#/components/schemas/{name}" for name in document["components"]["schemas"]}
     assert _references(document) <= known
-    assert {"/v1/bundle", "/v1/costs", "/healthz", "/readyz"} <= set(document["paths"])
+    assert {"post"} == document["paths"]["/v1/bundles/{name}/activate"].keys()
+    assert {"/v1/bundles", "/v1/bundles/{name}/rollback", "/v1/bundle", "/v1/costs", "/healthz", "/readyz"} <= set(
+        document["paths"]
+    )
 
 
 def test_the_documentation_page_is_served(served: Served) -> None:

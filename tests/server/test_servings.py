@@ -75,6 +75,18 @@ def test_one_that_nobody_holds_is_forgotten_when_it_is_replaced(versions: list[B
     assert [serving.bots.bundle for serving in servings] == [versions[2]]
 
 
+def test_one_that_is_still_held_becomes_active_again(versions: list[Bundle]) -> None:
+    handlers, servings = _served(versions[0])
+    first, second = servings.named(None), Serving(versions[1], max_bots=8)
+    connection = handlers.handle(Hello(), None, FORM).connection
+    servings.activate(second)
+    servings.activate(first)
+    assert list(servings) == [first]
+    handlers.end(connection)
+    servings.activate(first)
+    assert list(servings) == [first] == [servings.named(None)]
+
+
 def test_max_bots_counts_the_bots_of_all_of_them(versions: list[Bundle]) -> None:
     handlers, servings = _served(versions[0], max_bots=3)
     first = handlers.handle(Hello(), None, FORM).connection

@@ -20,9 +20,41 @@ def test_any_other_address_needs_a_token_or_an_explicit_word(host: str) -> None:
     assert Settings(bundle=Path("b"), host=host, insecure_no_token=True).host == host
 
 
+def test_one_folder_or_a_store() -> None:
+    for neither_nor_both in ({}, {"bundle": Path("b"), "store": Path("s")}):
+        with pytest.raises(ValueError, match="either a bundle or a store"):
+            Settings(**neither_nor_both)
+    assert Settings(store=Path("s")).bundle is None
+
+
+def test_tokens_come_from_files_too(tmp_path: Path) -> None:
+    token, admin = tmp_path / "token", tmp_path / "admin"
+    token.write_text("engines\n")
+    admin.write_text("operators")
+    assert Settings(bundle=Path("b"), token="t").tokens() == ("t", None)
+    settings = Settings(bundle=Path("b"), host="0.0.0.0", token_file=token, admin_token_file=admin)
+    assert settings.tokens() == ("engines", "operators")
+    with pytest.raises(ValueError, match="not both"):
+        Settings(bundle=Path("b"), token="t", token_file=token)
+    with pytest.raises(OSError, match="none"):
+        Settings(bundle=Path("b"), token_file=tmp_path / "none").tokens()
+    for content in (b"", b"\n", b"two\nlines\n", b"x" * 1025, b"\xff", b"a\0b"):
+        token.write_bytes(content)
+        with pytest.raises(ValueError, match=r"token|utf-8"):
+            settings.tokens()
+
+
 @pytest.mark.parametrize(
     "wrong",
-    [{"max_bots": 0}, {"max_connections": 0}, {"max_queue": 0}, {"idle_ttl_s": 0.0}, {"drain_s": -1.0}, {"token": ""}],
+    [
+        {"max_bots": 0},
+        {"max_connections": 0},
+        {"max_queue": 0},
+        {"max_loaded": 0},
+        {"idle_ttl_s": 0.0},
+        {"drain_s": -1.0},
+        {"token": ""},
+    ],
 )
 def test_limits_are_positive(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="must"):
