@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 
 from bot_runtime.company import Company
 from bot_runtime.context import Contexts
-from bot_runtime.draw import Asker, draw, finite_rows, timed_us
+from bot_runtime.deadline import Deadline
+from bot_runtime.draw import Asker, draw
+from bot_runtime.fallback import Cause
+from bot_runtime.haste import Haste
 from bot_runtime.request import Request
 from bot_runtime.turns import Queries, Turn
 
@@ -22,35 +25,87 @@ __all__ = ["Asking"]
 class Asking:
     """Begins turns of the bots of one arena. `clock` counts ns."""
 
-    def __init__(self, n_queries: int, contexts: Contexts, clock: Callable[[], int]) -> None:
-        self._n_queries, self._contexts, self._clock = n_queries, contexts, clock
+    def __init__(self, n_queries: int, contexts: Contexts, haste: Haste, clock: Callable[[], int]) -> None:
+        self._n_queries, self._contexts, self._haste, self._clock = n_queries, contexts, haste, clock
 
     def ask(
-        self, policy: Asker, company: Company, frame: int, request: Request, returns_to_go_N: NDArray[np.float64]
+        self,
+        policy: Asker,
+        company: Company,
+        frame: int,
+        request: Request,
+        returns_to_go_N: NDArray[np.float64],
+        deadline: Deadline | None = None,
     ) -> Turn:
-        """A turn whose query is drawn here, within the request's limits."""
-        batch, means = company.batch, request.means
-        batch.begin(request.free_NF, returns_to_go_N, means.terms.target_cost_N)
-        noise_NX = self._contexts.noise(batch)
-        drawn = draw(policy, batch, noise_NX, means, request.limits.frame_budget_us, self._clock)
-        for array in (drawn.query_NM, drawn.cost_us_N, drawn.probs_NM):
-            array.flags.writeable = False
-        queries = Queries(frame, drawn.query_NM, drawn.cost_us_N, drawn.probs_NM, drawn.infer_us)
-        noise_NA = noise_NX[:, self._n_queries :]
-        return Turn(frame, company.handles_N, request.content, queries, noise_NA, drawn.asks_N, request.budget_us)
+        """A turn whose query is drawn here, within the request's limits; of nothing where there is no time for that.
+
+        Raises NotReady where the deadline has passed and the request was refused.
+        """
+        n_bots, queries, allowed_us = company.n_bots, None, 0.0
+        noise_NX = self._contexts.noise(company.batch)
+        cause = self._haste.cause_against(deadline, n_bots, "query_probs")
+        if deadline is not None or cause is not None:
+            queries = Queries.of_nothing(frame, n_bots, self._n_queries, cause or Cause.DEADLINE)
+        if deadline is not None:
+            allowed_us = deadline.left_us()
+            deadline.offer(queries)
+        if cause is None:
+            drawn = self._draw(policy, company, frame, request, returns_to_go_N, noise_NX)
+            if deadline is None or self._haste.settle(deadline, n_bots, allowed_us, "query_probs"):
+                queries = drawn
+        assert queries is not None  # it is drawn, or there is a cause, or a deadline has passed
+        return self._turn(company, request, returns_to_go_N, queries, noise_NX, is_prepared=cause is None)
 
     def decided(
-        self, policy: Asker, company: Company, request: Request, returns_to_go_N: NDArray[np.float64], queries: Queries
+        self,
+        company: Company,
+        frame: int,
+        request: Request,
+        returns_to_go_N: NDArray[np.float64],
+        query_NM: NDArray[np.bool_],
+        cost_us_N: NDArray[np.float64],
     ) -> Turn:
-        """A turn whose query came with it. A bot that acquired something had a query, whatever the network says."""
-        batch = company.batch
-        batch.begin(request.free_NF, returns_to_go_N, request.means.terms.target_cost_N)
-        infer_us = timed_us(self._clock, policy.query_probs, batch)
-        asks_N = finite_rows(batch.probs_NM)
-        if asks_N is not None:
-            asks_N |= queries.query_NM.any(axis=1)
-            asks_N = None if asks_N.all() else asks_N
-        noise_NA = self._contexts.noise(batch)[:, self._n_queries :]
-        queries = queries._replace(probs_NM=batch.probs_NM.copy(), infer_us=infer_us)
-        content, budget_us = request.content, request.budget_us
-        return Turn(queries.frame, company.handles_N, content, queries, noise_NA, asks_N, budget_us, taken=True)
+        """A turn whose query came with it: the network is not asked, only run for what its step needs."""
+        noise_NX = self._contexts.noise(company.batch)
+        probs_NM = np.broadcast_to(np.float32(0.0), query_NM.shape)
+        queries = Queries(frame, query_NM, cost_us_N, probs_NM, 0.0)
+        turn = self._turn(company, request, returns_to_go_N, queries, noise_NX, is_prepared=False)
+        turn.taken = True
+        return turn
+
+    def _draw(
+        self,
+        policy: Asker,
+        company: Company,
+        frame: int,
+        request: Request,
+        returns_to_go_N: NDArray[np.float64],
+        noise_NX: NDArray[np.float32],
+    ) -> Queries:
+        batch, means = company.batch, request.means
+        batch.begin(request.free_NF, returns_to_go_N, means.terms.target_cost_N)
+        drawn = draw(policy, batch, noise_NX, means, request.limits.frame_budget_us, self._clock)
+        self._haste.observe("query_probs", company.n_bots, drawn.infer_us)
+        return Queries.of_draw(frame, drawn)
+
+    def _turn(
+        self,
+        company: Company,
+        request: Request,
+        returns_to_go_N: NDArray[np.float64],
+        queries: Queries,
+        noise_NX: NDArray[np.float32],
+        *,
+        is_prepared: bool,
+    ) -> Turn:
+        return Turn(
+            queries.frame,
+            company.handles_N,
+            request.content,
+            queries,
+            noise_NX[:, self._n_queries :],
+            request.budget_us,
+            returns_to_go_N,
+            request.means.terms.target_cost_N,
+            is_prepared,
+        )

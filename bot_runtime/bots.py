@@ -21,13 +21,15 @@ from bot_runtime.bundle import Bundle
 from bot_runtime.company import Companies, Company
 from bot_runtime.context import Contexts
 from bot_runtime.costs import MAX_ACQUIRE_US, Costs
+from bot_runtime.deadline import Deadline
 from bot_runtime.fallback import Counters
+from bot_runtime.haste import Haste
 from bot_runtime.policy import Policy
 from bot_runtime.request import NOTHING_SAID, Numbers, Request
 from bot_runtime.slots import Slots
 from bot_runtime.spending import Limits, Spending
 from bot_runtime.spent import Spent
-from bot_runtime.step import Step
+from bot_runtime.step import Chance, Step
 from bot_runtime.turns import Actions, Queries, Turn, Turns
 from protocol.errors import BadSchema, FrameReused
 from protocol.features import CostModel
@@ -61,13 +63,15 @@ class Bots:
         self.bundle = bundle
         self.counters = Counters()
         self.spent = Spent()
+        self.haste = Haste(clock)
+        self._clock = clock
         self._policy = Policy(bundle)
         generation = secrets.randbits(31) if first_generation is None else first_generation
         self._slots = Slots(max_bots, first_generation=generation)
         self._contexts = Contexts(bundle.manifest, max_bots)
         self._turns = Turns(max_bots, self.counters)
-        self._asking = Asking(bundle.manifest.features.n_queries, self._contexts, clock)
-        self._step = Step(bundle.manifest, self._contexts, self.counters, clock)
+        self._asking = Asking(bundle.manifest.features.n_queries, self._contexts, self.haste, clock)
+        self._step = Step(bundle.manifest, self._contexts, self.counters, self.haste, clock)
         self._spending = Spending(bundle.manifest, max_bots)
         self._companies = Companies(self._slots, self._contexts, self._spending)
         self._checks = inputs.FeatureChecks(bundle.manifest.features, max_bots)
@@ -129,14 +133,16 @@ class Bots:
         budgets_us: Numbers = None,
         target_costs_us: Numbers = None,
         costs: Costs | None = None,
+        deadline: Deadline | None = None,
     ) -> Queries:
         """What each bot asks for in this frame, within its own budget and, together, within `frame_budget_us`.
 
         `rewards_N` came since each bot's last frame and leave its return-to-go, once. `budgets_us` and
         `target_costs_us`, one number a bot, replace those of the bots' start for this frame only; how they make the
         network's target cost is `Spending.terms`. `costs`, as the bots' engine measures them, replace those of their
-        start for this frame. A newer frame abandons a pending query. Raises BadShape, BadSchema,
-        NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange.
+        start for this frame. A newer frame abandons a pending query. What cannot be decided by the `deadline` asks for
+        nothing, and says why. Raises BadShape, BadSchema, NoBot, StaleFrame, FrameReused, NonFinite, OutOfRange;
+        NotReady where the deadline passed before this began.
         """
         company = self._companies.named(handles, NOTHING_SAID)
         check_frame(frame)
@@ -146,11 +152,13 @@ class Bots:
             _check_same(said.content, retried.request, frame)
             return retried.queries
         returns_to_go_N = self._contexts.returns_to_go(company.batch) - said.rewards_N
-        turn = self._asking.ask(self._policy, company, frame, said, returns_to_go_N)
+        turn = self._asking.ask(self._policy, company, frame, said, returns_to_go_N, deadline)
         self._contexts.spend(company.batch, returns_to_go_N)
-        company.batch.keep_prepared()
+        if turn.is_prepared:
+            company.batch.keep_prepared()
         self._turns.begin(company, turn)
         self.spent.ask(turn.queries.cost_us_N, min(said.means.allowed_us, turn.budget_us))
+        self.counters.count_queries(company.n_bots, turn.queries.reasons_N)
         return turn.queries
 
     def submit_features(
@@ -162,13 +170,15 @@ class Bots:
         failed_NM: NDArray[np.bool_] | None = None,
         acquire_us: float | None = None,
         costs: Costs | None = None,
+        deadline: Deadline | None = None,
     ) -> Actions:
         """Answer the pending query of exactly these bots, in its order, and get their actions.
 
         `costly_ND` is dense; numbers of features that were not acquired, or are marked failed, are never looked at.
-        `acquire_us` is what acquiring took for all of these bots; `costs` learn from it, once a turn.
+        `acquire_us` is what acquiring took for all of these bots; `costs` learn from it, once a turn. What cannot be
+        decided by the `deadline` is the last action or a safe one, and no context advances.
         Raises BadShape, BadSchema, NoBot, StaleFrame, NoPendingQuery, UnrequestedFeature, MissingFeature, NonFinite,
-        OutOfRange, FrameReused.
+        OutOfRange, FrameReused; NotReady where the deadline passed before this began.
         """
         company = self._companies.named(handles, NOTHING_SAID)
         check_frame(frame)
@@ -181,7 +191,8 @@ class Bots:
             kept = (*self._contexts.acquired(batch), turn.measured_us)
             _check_same((staged_ND, known_NM, measured_us), kept, frame)
             return turn.actions
-        return self._answer(turn, batch, acquired_NM, known_NM, measured_us, costs)
+        chance = self._step.weigh(turn, batch, deadline)
+        return self._answer(turn, batch, chance, acquired_NM, known_NM, measured_us, costs)
 
     def take_turn(
         self,
@@ -198,6 +209,7 @@ class Bots:
         acquire_us: float | None = None,
         costs: Costs | None = None,
         replayed_returns_to_go: Numbers = None,
+        deadline: Deadline | None = None,
     ) -> Actions:
         """Both halves at once, where the engine has decided what to acquire: what it acquired or failed is the query.
 
@@ -221,12 +233,11 @@ class Bots:
         cost_us_N = said.means.cost_us(query_NM)
         if not replayed_N.size:
             said.means.check(cost_us_N, said.limits.frame_budget_us)
-        queries = Queries(frame, query_NM, cost_us_N, batch.probs_NM, 0.0)
-        turn = self._asking.decided(self._policy, company, said, left_N, queries)
+        turn = self._asking.decided(company, frame, said, left_N, query_NM, cost_us_N)
         turn.request = request
-        batch.keep_prepared()
+        chance = self._step.weigh(turn, batch, deadline)  # nothing is refused from here on
         np.copyto(batch.costly_ND, staged_ND)
-        actions = self._answer(turn, batch, acquired_NM, known_NM, measured_us, costs)
+        actions = self._answer(turn, batch, chance, acquired_NM, known_NM, measured_us, costs)
         if not replayed_N.size:
             self._contexts.spend(batch, left_N)
             self.spent.ask(cost_us_N, min(said.means.allowed_us, turn.budget_us))
@@ -250,6 +261,12 @@ class Bots:
         self._slots.release(slots_N)
         return int(slots_N.size)
 
+    def probe(self, n_bots: int) -> float:
+        """Run both graphs for so many bots, on zeros, touching none; how many µs that took. From any thread."""
+        started_ns = self._clock()
+        self._policy.check_batch(n_bots)
+        return (self._clock() - started_ns) / 1e3
+
     def _request(self, company: Company, *said: Any) -> Request:
         return Request.checked(self._checks, self._spending, company, *said)
 
@@ -267,6 +284,7 @@ class Bots:
         self,
         turn: Turn,
         batch: Batch,
+        chance: Chance,
         acquired_NM: NDArray[np.bool_],
         known_NM: NDArray[np.bool_],
         measured_us: _Floats,
@@ -274,7 +292,7 @@ class Bots:
     ) -> Actions:
         """Act on what was staged as acquired and is known, and learn what acquiring cost."""
         np.copyto(batch.query_NM, known_NM)
-        actions = self._step.act(self._policy, turn, batch)
+        actions = self._step.act(self._policy, turn, batch, chance)
         turn.actions, turn.measured_us = actions, measured_us
         batch.keep_acquired()
         if measured_us.size and costs is not None:

@@ -26,6 +26,7 @@ from bot_runtime.asking import Asking
 from bot_runtime.company import Company, Means
 from bot_runtime.context import Contexts
 from bot_runtime.costs import Costs
+from bot_runtime.haste import Haste
 from bot_runtime.manifest import Manifest
 from bot_runtime.policy import Acquisition
 from bot_runtime.request import NOTHING_SAID, Numbers, Request
@@ -75,7 +76,7 @@ class Head:
         self._checks = inputs.FeatureChecks(table, n_bots)
         self._acquisition, self._asking = (
             Acquisition(manifest, acquisition),
-            Asking(table.n_queries, self._contexts, clock),
+            Asking(table.n_queries, self._contexts, Haste(clock), clock),
         )
         self._costs, self._left_N = costs, returns_N
 

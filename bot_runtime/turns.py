@@ -7,13 +7,14 @@ module applies it to the bots of one message at once and keeps what a retry has 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bot_runtime.company import Company
-from bot_runtime.fallback import Counters
+from bot_runtime.draw import Draw
+from bot_runtime.fallback import Cause, Counters, non_finite
 from protocol.errors import FrameReused, NoPendingQuery
 from protocol.turn import Event, Phase, is_retry, transition
 
@@ -25,13 +26,33 @@ _Ints = NDArray[np.int64]
 
 
 class Queries(NamedTuple):
-    """What each bot asks for, its predicted cost in µs, the Bernoulli means it was drawn from, and µs of inference."""
+    """What each bot asks for, its predicted cost in µs, the Bernoulli means it was drawn from, and µs of inference.
+
+    `reasons_N` (`bot_runtime.fallback.Reason`) says why nothing was asked for; None where every query is learned.
+    """
 
     frame: int
     query_NM: NDArray[np.bool_]
     cost_us_N: NDArray[np.float64]
     probs_NM: NDArray[np.float32]
     infer_us: float
+    reasons_N: NDArray[np.uint8] | None = None
+
+    @classmethod
+    def of_draw(cls, frame: int, drawn: Draw) -> Self:
+        """What was drawn, read-only."""
+        reasons_N = None if drawn.asks_N is None else non_finite(drawn.asks_N)
+        for array in (drawn.query_NM, drawn.cost_us_N, drawn.probs_NM):
+            array.flags.writeable = False
+        return cls(frame, drawn.query_NM, drawn.cost_us_N, drawn.probs_NM, drawn.infer_us, reasons_N)
+
+    @classmethod
+    def of_nothing(cls, frame: int, n_bots: int, n_queries: int, cause: Cause) -> Self:
+        """No bot asks for anything, without having been asked, read-only."""
+        query_NM = np.broadcast_to(np.False_, (n_bots, n_queries))
+        probs_NM = np.broadcast_to(np.float32(0.0), (n_bots, n_queries))
+        reasons_N = np.broadcast_to(np.uint8(cause), n_bots)
+        return cls(frame, query_NM, np.broadcast_to(0.0, n_bots), probs_NM, 0.0, reasons_N)
 
 
 class Actions(NamedTuple):
@@ -50,11 +71,13 @@ class Turn:
 
     frame: int
     handles_N: _Ints
-    request: tuple[NDArray[np.generic], ...]  # what a retry must equal
+    request: tuple[NDArray[Any], ...]  # what a retry must equal
     queries: Queries
     noise_NA: NDArray[np.float32]
-    asks_N: NDArray[np.bool_] | None  # whose query_probs were finite; None: everyone's
     budget_us: float  # of all of its bots together, infinite where any has none
+    left_N: NDArray[np.float64]  # returns to go
+    target_cost_N: NDArray[np.float32]
+    is_prepared: bool  # whether the acquisition graph has run: if not, it does before the action graph
     actions: Actions | None = None
     measured_us: NDArray[np.float64] = field(
         default_factory=lambda: np.zeros(0)

@@ -111,11 +111,14 @@ class BotClient:
         frame_budget_us: float | None = None,
         budgets_us: ArrayLike | None = None,
         target_costs_us: ArrayLike | None = None,
+        deadline_us: float | None = None,
     ) -> Queries:
         """Ask which costly features to acquire, given `free` [N, F] and the `rewards` [N] since each bot's last frame.
 
         `frame_budget_us` is shared by all these bots, on top of each bot's own budget. `budgets_us` and
-        `target_costs_us` [N] replace those of the bots' start for this frame only. Raises BadShape locally too.
+        `target_costs_us` [N] replace those of the bots' start for this frame only. `deadline_us` is how long after the
+        server has received this its answer must leave; one that cannot be decided by then asks for nothing and says
+        so in `reasons`. Raises BadShape locally too.
         """
         table, handles = self.welcome.features, _handles(bots)
         message = {"type": "request_queries", "frame": int(frame), "bots": handles}
@@ -124,6 +127,7 @@ class BotClient:
         _add_number(message, "frame_budget_us", frame_budget_us)
         _add_numbers(message, "budgets_us", budgets_us)
         _add_numbers(message, "target_costs_us", target_costs_us)
+        _add_number(message, "deadline_us", deadline_us)
         return read_queries(self._framed(message), len(handles), table)
 
     def act(
@@ -135,18 +139,21 @@ class BotClient:
         failed: ArrayLike | None = None,
         acquire_us: float | None = None,
         hidden: bool = False,
+        deadline_us: float | None = None,
     ) -> Actions:
         """Answer the pending query of the same bots and frame, and get their actions.
 
         `acquired` and `failed` are bool [N, M], together exactly what was asked for; `costly` is [N, D], of which only
         the acquired numbers are read and sent. `acquire_us` is what acquiring all of this took: the server then keeps
         budgets by what it measures, if its welcome has a `cost_quantile`. `hidden` asks for the hidden state, which a
-        head in the engine reads. Raises BadShape locally too.
+        head in the engine reads. `deadline_us` is as in `query`: what is not decided by then is the last action, or a
+        safe one. Raises BadShape locally too.
         """
         welcome, handles = self.welcome, _handles(bots)
         message = {"type": "submit_features", "frame": int(frame), "bots": handles}
         _add_acquired(message, welcome.features, len(handles), acquired, costly, failed)
         _add_number(message, "acquire_us", acquire_us)
+        _add_number(message, "deadline_us", deadline_us)
         if hidden:
             message["hidden"] = True
         return read_actions(self._framed(message), len(handles), welcome.action)
@@ -166,6 +173,7 @@ class BotClient:
         target_costs_us: ArrayLike | None = None,
         hidden: bool = True,
         replayed_returns_to_go: ArrayLike | None = None,
+        deadline_us: float | None = None,
     ) -> Actions:
         """A whole turn in one round trip, where the engine has decided what to acquire; arguments as in both halves.
 
@@ -184,6 +192,7 @@ class BotClient:
         if hidden:
             message["hidden"] = True
         _add_numbers(message, "replayed_returns_to_go", replayed_returns_to_go)
+        _add_number(message, "deadline_us", deadline_us)
         return read_actions(self._framed(message), len(handles), welcome.action)
 
     def stop(self, bots: ArrayLike) -> int:

@@ -17,7 +17,7 @@ from protocol.errors import BadJson, BadMsgpack, BadSchema, ProtocolError, TooDe
 from protocol.features import FeatureTable
 from protocol.messages import MAX_BOTS_PER_MESSAGE, Request
 
-__all__ = ["MAX_DETAIL_CHARS", "Format", "body_limit", "decode", "decode_request", "encode"]
+__all__ = ["MAX_DETAIL_CHARS", "Format", "body_limit", "decode", "decode_request", "encode", "peek_deadline_us"]
 
 MAX_DETAIL_CHARS = 300
 _HANDLE_BYTES = 21  # a 63-bit integer in JSON with its comma
@@ -37,6 +37,12 @@ class Format(Enum):
     JSON = "application/json"
 
 
+class _Peeked(msgspec.Struct):
+    """One field of any message."""
+
+    deadline_us: float | None = None
+
+
 _NUMBER_BYTES = {Format.MSGPACK: 9, Format.JSON: 26}  # a double at its widest, with its comma in JSON
 
 
@@ -49,6 +55,15 @@ def body_limit(table: FeatureTable, max_bots: int, form: Format) -> int:
     per_turn = number_bytes * (table.n_free + table.n_costly + 4) + 2 * _BIT_BYTES * table.n_queries
     per_bot = _HANDLE_BYTES + 16 + max(per_turn, 5 * number_bytes)
     return _FIXED_BYTES + number_bytes * table.n_queries + per_bot * max_bots
+
+
+def peek_deadline_us(body: bytes, form: Format) -> float | None:
+    """The deadline that a message of any type names, without reading the rest of it; None where it cannot be told."""
+    try:
+        peeked: _Peeked = _decoder(form, _Peeked).decode(body)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None  # `decode` will say what is wrong with it
+    return peeked.deadline_us
 
 
 def decode(body: bytes, form: Format, message: type[Message]) -> Message:

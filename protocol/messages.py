@@ -14,6 +14,7 @@ from protocol.features import ActionSpec, CostModel, FeatureTable
 
 __all__ = [
     "MAX_BOTS_PER_MESSAGE",
+    "MAX_DEADLINE_US",
     "MAX_FRAME",
     "MAX_RETURN",
     "MAX_RETURN_TO_GO",
@@ -41,6 +42,7 @@ __all__ = [
 PROTOCOL_VERSION = 1
 MAX_BOTS_PER_MESSAGE = 65536
 MAX_FRAME = 2**53  # the largest count that a JSON number or a double holds exactly
+MAX_DEADLINE_US = 1e9
 MAX_RETURN = 1e9  # of one reward or target return: float32 holds sums of very many
 MAX_RETURN_TO_GO = 1e30  # what no sum of them reaches, and float32 holds
 
@@ -83,7 +85,8 @@ class Welcome(_Message, frozen=True, tag="welcome"):
     `budget_us` is a bot's default budget, `target_cost_us` its default target cost, null where the bundle has none.
     `cost_quantile` is how often acquiring is to take no longer than predicted, once it is measured; null where a
     server takes no measurements. `bundle_version` is null where the server has no store of versions; `bundle_sha256` is
-    of the bundle's manifest, which has the hashes of its other files.
+    of the bundle's manifest, which has the hashes of its other files. `deadline_us` is what counts for requests that
+    name none, if anything.
     `replay_frames` is how many of a bot's last turns rebuild its context, `target_return` a bot's target return unless
     told otherwise; null from a server that knows no `take_turn`.
     """
@@ -103,6 +106,7 @@ class Welcome(_Message, frozen=True, tag="welcome"):
     bundle_sha256: str | None = None
     replay_frames: int | None = None
     target_return: float | None = None
+    deadline_us: float | None = None
 
 
 class StartBots(_Message, frozen=True, tag="start_bots"):
@@ -131,7 +135,8 @@ class RequestQueries(_Message, frozen=True, tag="request_queries"):
     """Ask which costly features to acquire. `free` is [N, F]; `rewards` [N] came since each bot's last frame.
 
     `frame_budget_us` is shared by all bots of the message, on top of each bot's own budget. `budgets_us` and
-    `target_costs_us` [N] replace those of the bots' start for this frame only.
+    `target_costs_us` [N] replace those of the bots' start for this frame only. `deadline_us` is how long after the
+    server has received the whole request its answer must leave.
     """
 
     frame: _Frame
@@ -141,15 +146,22 @@ class RequestQueries(_Message, frozen=True, tag="request_queries"):
     frame_budget_us: float | None = None
     budgets_us: _PerBot | None = None
     target_costs_us: _PerBot | None = None
+    deadline_us: float | None = None
 
 
 class Queries(_Message, frozen=True, tag="queries"):
-    """The queries, bits [N, M], their predicted cost [N] in µs and the time spent deciding, in µs."""
+    """The queries, bits [N, M], their predicted cost [N] in µs and the time spent deciding, in µs.
+
+    `reasons` [N] says why a bot asks for nothing where that was not decided (0 = it was); null: all were. `late`: this
+    reply leaves after its deadline all the same.
+    """
 
     frame: _Frame
     queries: Bits
     cost_us: list[float]
     infer_us: float
+    reasons: list[int] | None = None
+    late: bool = False
 
 
 class SubmitFeatures(_Message, frozen=True, tag="submit_features"):
@@ -157,7 +169,8 @@ class SubmitFeatures(_Message, frozen=True, tag="submit_features"):
 
     `acquired` and `failed` are bits [N, M]. `values` is ragged: for each bot in order, for each acquired feature in
     order, its `size` numbers (float32 little-endian bytes, or one list a bot). `acquire_us` is what acquiring all of
-    this took, as the engine measured it. `hidden` asks for each bot's hidden state in the reply.
+    this took, as the engine measured it. `hidden` asks for each bot's hidden state in the reply. `deadline_us` is as in
+    RequestQueries.
     """
 
     frame: _Frame
@@ -167,6 +180,7 @@ class SubmitFeatures(_Message, frozen=True, tag="submit_features"):
     failed: Bits | None = None
     acquire_us: float | None = None
     hidden: bool = False
+    deadline_us: float | None = None
 
 
 class TakeTurn(_Message, frozen=True, tag="take_turn"):
@@ -190,12 +204,14 @@ class TakeTurn(_Message, frozen=True, tag="take_turn"):
     target_costs_us: _PerBot | None = None
     hidden: bool = False
     replayed_returns_to_go: _PerBot | None = None
+    deadline_us: float | None = None
 
 
 class Actions(_Message, frozen=True, tag="actions"):
     """The actions [N, A]; why each bot got its action (0 = learned) [N]; the time spent deciding, in µs.
 
     `turns` [N] says how many turns each bot's context has taken; `hidden` [N, W] is its state after them, if asked for.
+    `late`: this reply leaves after its deadline all the same.
     """
 
     frame: _Frame
@@ -204,6 +220,7 @@ class Actions(_Message, frozen=True, tag="actions"):
     infer_us: float
     turns: list[int] | None = None
     hidden: Blob | None = None
+    late: bool = False
 
 
 class StopBots(_Message, frozen=True, tag="stop_bots"):

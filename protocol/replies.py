@@ -68,16 +68,21 @@ class Welcome(NamedTuple):
 
 
 class Queries(NamedTuple):
-    """Which costly features to acquire: `queries` bool [N, M], `cost_us` float64 [N] predicted, `infer_us` spent."""
+    """Which costly features to acquire: `queries` bool [N, M], `cost_us` float64 [N] predicted, `infer_us` spent.
+
+    `reasons` uint8 [N]: why a bot asks for nothing, 0 where that is learned. `late`: it left after its deadline.
+    """
 
     frame: int
     queries: NDArray[np.bool_]
     cost_us: NDArray[np.float64]
     infer_us: float
+    reasons: NDArray[np.uint8]
+    late: bool = False
 
 
 class Actions(NamedTuple):
-    """What to do: `actions` float32 [N, A]; `reasons` uint8 [N], 0 = learned; `infer_us` spent.
+    """What to do: `actions` float32 [N, A]; `reasons` uint8 [N], 0 = learned; `infer_us` spent; `late` as in Queries.
 
     `turns` int64 [N] is how many each context took, None from an older server; `hidden` float32 [N, W] if asked for.
     """
@@ -88,6 +93,7 @@ class Actions(NamedTuple):
     infer_us: float
     turns: NDArray[np.int64] | None = None
     hidden: NDArray[np.float32] | None = None
+    late: bool = False
 
 
 def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
@@ -142,18 +148,25 @@ def read_queries(reply: dict[str, Any], bots: int, table: FeatureTable) -> Queri
         bytes_NB = np.frombuffer(reply["queries"], dtype=np.uint8).reshape(bots, -(-table.n_queries // 8))
         queries_NM = np.unpackbits(bytes_NB, axis=1, count=table.n_queries, bitorder="little").view(np.bool_)
         cost_us_N = np.array(reply["cost_us"], dtype=np.float64).reshape(bots)
-        return Queries(int(reply["frame"]), queries_NM, cost_us_N, float(reply["infer_us"]))
+        reasons_N = _reasons(reply.get("reasons") or [0] * bots, bots)
+        infer_us, late = float(reply["infer_us"]), bool(reply.get("late"))
+        return Queries(int(reply["frame"]), queries_NM, cost_us_N, infer_us, reasons_N, late)
 
 
 def read_actions(reply: dict[str, Any], bots: int, action: ActionSpec) -> Actions:
     """The fields of an `actions` for N = `bots`; raises ReplyError."""
     with _reading("submit_features"):
         actions_NA = np.frombuffer(reply["actions"], dtype="<f4").reshape(bots, action.size)
-        reasons_N = np.array(reply["reasons"], dtype=np.uint8).reshape(bots)
+        reasons_N = _reasons(reply["reasons"], bots)
+        infer_us, late = float(reply["infer_us"]), bool(reply.get("late"))
         turns, hidden = reply.get("turns"), reply.get("hidden")
         turns_N = None if turns is None else np.array(turns, dtype=np.int64).reshape(bots)
         hidden_NW = None if hidden is None else np.frombuffer(hidden, dtype="<f4").reshape(bots, -1)
-        return Actions(int(reply["frame"]), actions_NA, reasons_N, float(reply["infer_us"]), turns_N, hidden_NW)
+        return Actions(int(reply["frame"]), actions_NA, reasons_N, infer_us, turns_N, hidden_NW, late)
+
+
+def _reasons(reasons: list[int], bots: int) -> NDArray[np.uint8]:
+    return np.array(reasons, dtype=np.uint8).reshape(bots)
 
 
 def _read_version(reply: dict[str, Any]) -> dict[str, Any]:

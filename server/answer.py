@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from typing import NamedTuple, Self
 
+from bot_runtime.deadline import Deadline
 from protocol import codec
 from protocol.codec import Format
 from protocol.errors import InternalError, ProtocolError
@@ -22,10 +23,12 @@ _log = logger(__name__)
 
 
 class Arrival(NamedTuple):
-    """By which transport a request came (`http`, `tcp`, `unix`) and when it was whole: ns of the monotonic clock."""
+    """By which transport a request came (`http`, `tcp`, `unix`), when it was whole (ns of the monotonic clock) and by
+    when it is to be answered, if that is said."""
 
     transport: str
     received_ns: int
+    deadline: Deadline | None = None
 
     @classmethod
     def now(cls, transport: str) -> Self:
@@ -66,7 +69,7 @@ def answer(
         else:
             request = codec.decode_request(sent, form) if kind is None else codec.decode(sent, form, kind)
             wait_ns, decode_ns = started_ns - arrival.received_ns, clock() - started_ns
-        reply = handlers.handle(request, connection_id, reply_form)
+        reply = handlers.handle(request, connection_id, reply_form, arrival.deadline)
         handled_ns = clock()
         encoded = codec.encode(reply, reply_form)
         encoded_ns = clock()

@@ -22,11 +22,13 @@ from server.admin import AdminDoor, add_routes
 from server.catalogue import Catalogue
 from server.connections import Connections
 from server.desk import Desk
+from server.due import Due
 from server.exchange import Exchange
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
 from server.observation import watch
 from server.probes import Probes
+from server.probing import probing
 from server.prompt import prompt_http
 from server.serving import Serving
 from server.servings import Servings
@@ -40,6 +42,7 @@ from server.worker import Worker
 __all__ = ["running"]
 
 _BACKLOG = 512
+_CLOSE_S = 0.5  # for what is still running after the drain
 
 
 @asynccontextmanager
@@ -52,12 +55,13 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
     token, admin_token = settings.tokens()
     servings = Servings(settings.max_bots, settings.max_loaded)
     connections = Connections(settings.max_connections, settings.idle_ttl_s, clock, process=settings.process)
-    handlers = Handlers(servings, connections, token)
+    default_us = settings.default_deadline_us
+    handlers = Handlers(servings, connections, token, default_deadline_us=default_us)
     async with AsyncExitStack() as stack:
         worker = Worker(settings.max_queue)
-        stack.callback(worker.close)
+        stack.callback(worker.close, _CLOSE_S)
         admin = AdminDoor(handlers, worker, _filled(servings, worker, settings), admin_token=admin_token)
-        desk = Desk(handlers, worker, inline_us=settings.inline_us)
+        desk = Desk(handlers, worker, inline_us=settings.inline_us, due=Due(worker, default_us=default_us))
         sockets = Sockets(
             desk,
             max_sockets=settings.max_connections,
@@ -77,6 +81,7 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             "ws": ws_address,
             **await stack.enter_async_context(_streams(settings, sockets)),
         }
+        await stack.enter_async_context(probing(servings))
         await stack.enter_async_context(_sweeping(handlers, worker, settings.idle_ttl_s / 4))
         try:
             yield addresses

@@ -16,6 +16,7 @@ from protocol.codec import Format
 from protocol.errors import NotReady, ProtocolError
 from protocol.messages import Request, RequestQueries, SubmitFeatures, TakeTurn
 from server.answer import Answer, Arrival, answer, refusal
+from server.due import Due
 from server.handlers import Handlers
 from server.worker import Worker
 
@@ -58,9 +59,16 @@ class Desk:
     """
 
     def __init__(
-        self, handlers: Handlers, worker: Worker, *, inline_us: float, clock: Callable[[], int] = time.thread_time_ns
+        self,
+        handlers: Handlers,
+        worker: Worker,
+        *,
+        inline_us: float,
+        due: Due | None = None,
+        clock: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         self.handlers = handlers
+        self.due = due or Due(worker)
         self._worker = worker
         self._inline_us = inline_us
         self._clock = clock
@@ -77,29 +85,56 @@ class Desk:
         reply_form: Format | None = None,
     ) -> Answered:
         """The answer, or the future of it. Arguments are those of `server.answer.answer`."""
-        how = partial(answer, self.handlers, arrival=arrival, kind=kind, reply_form=reply_form)
+        how = partial(answer, self.handlers, kind=kind, reply_form=reply_form)
+        reply_form = reply_form or form
         if len(body) > _MAX_INLINE_BYTES:
-            return self._hop(partial(how, body, form, connection_id), arrival, reply_form or form)
+            deadline = self.due.of(codec.peek_deadline_us(body, form), arrival.received_ns)
+            arrival = arrival._replace(deadline=deadline)
+            job = partial(how, body, form, connection_id, arrival)
+            return self._in_time(job, arrival, (bytes, len(body)), reply_form)
         try:
             request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)
         except ProtocolError:
-            return how(body, form, connection_id)  # which refuses it, bots untouched
-        decoded = partial(how, request, form, connection_id, decoded_ns=time.monotonic_ns())
+            return how(body, form, connection_id, arrival)  # which refuses it, bots untouched
+        how = partial(how, request, form, connection_id, decoded_ns=time.monotonic_ns())
         if not isinstance(request, RequestQueries | SubmitFeatures | TakeTurn):
-            return self._hop(decoded, arrival, reply_form or form)
+            return self._hop(partial(how, arrival), arrival, reply_form)
+        deadline = self.due.of(request.deadline_us, arrival.received_ns)
+        arrival = arrival._replace(deadline=deadline)
         turn = type(request), len(request.bots).bit_length()
-        job = partial(self._timed, turn, decoded)
+        job = partial(self._timed, turn, partial(how, arrival))
         if self._worker.is_idle and self._pace.expected_us(turn) <= self._inline_us:
-            return job()
-        return self._hop(job, arrival, reply_form or form)
+            return job() if deadline is None else self.due.kept(deadline, job(), reply_form)
+        return self._in_time(job, arrival, (type(request), len(request.bots)), reply_form)
 
     def end(self, connection_id: str) -> None:
         """End a connection whose socket has closed, after what was asked for on it."""
         self._worker.post(partial(self.handlers.end, connection_id))
 
-    def _hop(self, job: Callable[[], Answer], arrival: Arrival, form: Format) -> Answered:
+    def _in_time(
+        self, job: Callable[[], Answer], arrival: Arrival, work: tuple[type[object], int], form: Format
+    ) -> Answered:
+        """Have the worker do work of this kind and size by its deadline, or refuse it where that cannot be."""
+        expected_us, deadline = self.due.expected_us(*work), arrival.deadline
+        if deadline is not None:
+            refused = self.due.refusal_of(deadline, expected_us, form)
+            if refused is not None:
+                self.handlers.recorder.refused(arrival.transport, NotReady.code)
+                return refused
+        answered = self._hop(partial(self._measured, work, job), arrival, form, expected_us)
+        if deadline is None or isinstance(answered, Answer):
+            return answered
+        return self.due.watched(deadline, answered, form)
+
+    def _measured(self, work: tuple[type[object], int], job: Callable[[], Answer]) -> Answer:
+        begun_ns = time.monotonic_ns()
+        answered = job()
+        self.due.observe(*work, (time.monotonic_ns() - begun_ns) / 1e3)
+        return answered
+
+    def _hop(self, job: Callable[[], Answer], arrival: Arrival, form: Format, expected_us: float = 0.0) -> Answered:
         try:
-            return self._worker.run(job)
+            return self._worker.run(job, expected_us)
         except NotReady as error:
             self.handlers.recorder.refused(arrival.transport, error.code)
             return refusal(error, form)

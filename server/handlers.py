@@ -7,16 +7,17 @@ before any bot is touched, so a refused request leaves every bot as it was.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from msgspec.structs import replace
 
-from bot_runtime import turns
 from bot_runtime.costs import Report
-from bot_runtime.inputs import check_costs
+from bot_runtime.deadline import Deadline
+from bot_runtime.inputs import check_costs, per_bot
 from protocol import arrays
 from protocol.codec import Format
 from protocol.errors import BadSchema
 from protocol.features import CostModel
 from protocol.messages import (
+    MAX_DEADLINE_US,
     PROTOCOL_VERSION,
     Actions,
     BotsStarted,
@@ -40,6 +41,7 @@ from server.recorder import Recorder
 from server.serving import Serving
 from server.servings import Servings
 from server.tokens import check
+from server.written import written
 
 __all__ = ["Handlers"]
 
@@ -49,13 +51,22 @@ _log = logger(__name__)
 class Handlers:
     """Answers requests of known connections with bots of these servings. `token` is what Hello must carry, if any.
 
-    `recorder` is where whoever hands on requests counts them.
+    `recorder` is where whoever hands on requests counts them. `default_deadline_us` is what Welcome says of requests
+    that name no deadline.
     """
 
-    def __init__(self, servings: Servings, connections: Connections, token: str | None) -> None:
+    def __init__(
+        self,
+        servings: Servings,
+        connections: Connections,
+        token: str | None,
+        *,
+        default_deadline_us: float | None = None,
+    ) -> None:
         self.servings = servings
         self._connections = connections
         self._token = token
+        self._default_deadline_us = default_deadline_us
         self.recorder = Recorder()
 
     @property
@@ -63,18 +74,20 @@ class Handlers:
         """The longest message that is read, by format; safe to read from any thread."""
         return self.servings.max_body_bytes
 
-    def handle(self, request: Request, connection_id: str | None, form: Format) -> Reply:
+    def handle(
+        self, request: Request, connection_id: str | None, form: Format, deadline: Deadline | None = None
+    ) -> Reply:
         """The reply to one request, its blobs written for `form`. Raises ProtocolError, having done nothing."""
         if isinstance(request, Hello):
             return self._hello(request, connection_id, form)
         connection = self._connections.get(connection_id)
         match request:
             case RequestQueries():
-                return self._request_queries(request, connection, form)
+                return self._request_queries(request, connection, form, deadline)
             case SubmitFeatures():
-                return self._submit_features(request, connection, form)
+                return self._submit_features(request, connection, form, deadline)
             case TakeTurn():
-                return self._take_turn(request, connection, form)
+                return self._take_turn(request, connection, form, deadline)
             case StartBots():
                 return self._start_bots(request, connection)
             case StopBots():
@@ -116,7 +129,8 @@ class Handlers:
         is_pinned = hello.bundle is not None and "@" in hello.bundle
         connection = self._connections.open(cost_model, serving, is_pinned=is_pinned)
         self.servings.hold(serving)
-        return serving.welcome(connection.id, cost_model, connection.costs.quantile, form)
+        welcome = serving.welcome(connection.id, cost_model, connection.costs.quantile, form)
+        return replace(welcome, deadline_us=self._default_deadline_us)
 
     def _start_bots(self, request: StartBots, connection: Connection) -> BotsStarted:
         serving = self._serving_of_next_bots(connection)
@@ -143,8 +157,11 @@ class Handlers:
             return connection.serving
         return self.servings.successor(connection.serving)
 
-    def _request_queries(self, request: RequestQueries, connection: Connection, form: Format) -> Queries:
+    def _request_queries(
+        self, request: RequestQueries, connection: Connection, form: Format, deadline: Deadline | None
+    ) -> Queries | Actions:
         connection.check_owns(request.bots)
+        _check_deadline(request.deadline_us)
         serving = connection.serving
         free_NF = arrays.floats(request.free, (len(request.bots), serving.table.n_free), "free")
         handles_N = np.array(request.bots, dtype=np.int64)
@@ -157,12 +174,15 @@ class Handlers:
             request.budgets_us,
             request.target_costs_us,
             connection.measured_costs,
+            deadline,
         )
-        queries = arrays.pack_bits(turn.query_NM, form)
-        return Queries(frame=turn.frame, queries=queries, cost_us=turn.cost_us_N.tolist(), infer_us=turn.infer_us)
+        return written(turn, form)
 
-    def _submit_features(self, request: SubmitFeatures, connection: Connection, form: Format) -> Actions:
+    def _submit_features(
+        self, request: SubmitFeatures, connection: Connection, form: Format, deadline: Deadline | None
+    ) -> Queries | Actions:
         connection.check_owns(request.bots)
+        _check_deadline(request.deadline_us)
         serving = connection.serving
         shape = len(request.bots), serving.table.n_queries
         acquired_NM = arrays.bits(request.acquired, shape, "acquired")
@@ -170,12 +190,15 @@ class Handlers:
         costly_ND = arrays.unpack_values(request.values, acquired_NM, serving.table)
         handles_N = np.array(request.bots, dtype=np.int64)
         turn = serving.bots.submit_features(
-            handles_N, request.frame, acquired_NM, costly_ND, failed_NM, request.acquire_us, connection.costs
+            handles_N, request.frame, acquired_NM, costly_ND, failed_NM, request.acquire_us, connection.costs, deadline
         )
-        return _actions(turn, serving.bots.hidden(handles_N) if request.hidden else None, form)
+        return written(turn, form, serving.bots.hidden(handles_N) if request.hidden else None)
 
-    def _take_turn(self, request: TakeTurn, connection: Connection, form: Format) -> Actions:
+    def _take_turn(
+        self, request: TakeTurn, connection: Connection, form: Format, deadline: Deadline | None
+    ) -> Queries | Actions:
         connection.check_owns(request.bots)
+        _check_deadline(request.deadline_us)
         serving, n_bots = connection.serving, len(request.bots)
         acquired_NM = arrays.bits(request.acquired, (n_bots, serving.table.n_queries), "acquired")
         handles_N = np.array(request.bots, dtype=np.int64)
@@ -193,8 +216,9 @@ class Handlers:
             request.acquire_us,
             connection.costs,
             request.replayed_returns_to_go,
+            deadline,
         )
-        return _actions(turn, serving.bots.hidden(handles_N) if request.hidden else None, form)
+        return written(turn, form, serving.bots.hidden(handles_N) if request.hidden else None)
 
     def _stop_bots(self, request: StopBots, connection: Connection) -> BotsStopped:
         connection.check_owns(request.bots)
@@ -212,12 +236,7 @@ class Handlers:
         self.servings.release(connection.serving)
 
 
-def _actions(turn: turns.Actions, hidden_NW: NDArray[np.float32] | None, form: Format) -> Actions:
-    return Actions(
-        frame=turn.frame,
-        actions=arrays.pack_floats(turn.action_NA, form),
-        reasons=turn.reasons_N.tolist(),
-        infer_us=turn.infer_us,
-        turns=turn.turns_N.tolist(),
-        hidden=None if hidden_NW is None else arrays.pack_floats(hidden_NW, form),
-    )
+def _check_deadline(deadline_us: float | None) -> None:
+    """Raises NonFinite, OutOfRange."""
+    if deadline_us is not None:
+        per_bot("deadline_us", (deadline_us,), 1, 0.0, MAX_DEADLINE_US)

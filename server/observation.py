@@ -37,6 +37,7 @@ def watch(
     """What every server is asked about; whoever assembles it may register more."""
     readiness, metrics = Readiness(), Metrics()
     readiness.register("bundle", partial(_no_bundle, handlers))
+    readiness.register("breaker", partial(_too_slow, handlers))
     readiness.register("worker", partial(_stuck, worker.busy_s, settings.stuck_after_s))
     metrics.register(partial(families.requests, handlers.recorder))
     metrics.register(lambda: families.bundles(handlers.servings))
@@ -48,6 +49,11 @@ def watch(
 
 def _no_bundle(handlers: Handlers) -> str | None:
     return None if any(True for _ in handlers.servings) else "no bundle is served"
+
+
+def _too_slow(handlers: Handlers) -> str | None:
+    open_breakers = handlers.servings.open_breakers()
+    return f"too slow, so falling back: {', '.join(open_breakers)}" if open_breakers else None
 
 
 def _stuck(busy_s: Callable[[], float], stuck_after_s: float) -> str | None:

@@ -45,6 +45,10 @@ class Servings:
         """The active one of this name, if there is one."""
         return self._active.get(name)
 
+    def open_breakers(self) -> list[str]:
+        """The bundles that fall back now because they are too slow; safe from any thread."""
+        return [serving.name for serving in self if serving.bots.haste.breaker.is_open]
+
     def named(self, bundle: str | None) -> Serving:
         """The active one of this name, or NAME@VERSION in memory; None is the only name there is. Raises NoBundle."""
         if bundle is None:

@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from protocol.messages import MAX_DEADLINE_US
 from server.tokens import read_token
 
 __all__ = ["Settings"]
@@ -55,6 +56,8 @@ class Settings:
     """A client has this long to send one whole request, and to take one whole reply."""
     stuck_after_s: float = 2.0
     """Not ready while one piece of the inference thread's work has been running for this long."""
+    default_deadline_us: float | None = None
+    """By when after its receipt a turn's request is answered where it does not say. Never unless given."""
     drain_s: float = 5.0
     """After SIGTERM, requests in progress have this long to finish."""
     token: str | None = None
@@ -85,6 +88,8 @@ class Settings:
             raise ValueError("inline_us must not be negative")
         if self.process is not None and not _PROCESS.fullmatch(self.process):
             raise ValueError(f"process {self.process[:80]!r} does not match {_PROCESS.pattern}")
+        if self.default_deadline_us is not None and not 0 < self.default_deadline_us <= MAX_DEADLINE_US:
+            raise ValueError(f"default_deadline_us must be more than 0 and at most {MAX_DEADLINE_US:g}")
         if self.token == "":
             raise ValueError("the token must not be empty")
         if self.token is not None and self.token_file is not None:

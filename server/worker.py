@@ -10,6 +10,7 @@ import asyncio
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -34,6 +35,7 @@ class Worker:
         self._busy_since_s: float | None = None
         self._taken = 0  # jobs that were put into the queue: the event loop alone counts them
         self._done = 0  # jobs that have ended: the thread alone counts them
+        self._expected_us: deque[float] = deque()  # what each took or takes, of those that were put last
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="inference", daemon=True)
         self._thread.start()
@@ -53,24 +55,39 @@ class Worker:
         since_s = self._busy_since_s
         return 0.0 if since_s is None else self._clock() - since_s
 
-    def run(self, job: Callable[[], T]) -> asyncio.Future[T]:
-        """The job's result to be, or what it raises. Raises NotReady at once when too many jobs wait already."""
+    @property
+    def backlog_us(self) -> float:
+        """How long it will take for all that runs or waits here to be done, by what was expected of it."""
+        while len(self._expected_us) > self.n_waiting:
+            self._expected_us.popleft()
+        if not self._expected_us:
+            return 0.0
+        return sum(self._expected_us) - min(1e6 * self.busy_s(), self._expected_us[0])
+
+    def run(self, job: Callable[[], T], expected_us: float = 0.0) -> asyncio.Future[T]:
+        """The job's result to be, or what it raises. Raises NotReady at once when too many jobs wait already.
+
+        `expected_us` is what it will take, if that is known.
+        """
         if self.n_waiting >= self.max_queue:
             raise NotReady(f"{self.n_waiting} requests are waiting already", retry_after_s=0.1)
         outcome: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        self._put(_Job(job, outcome))
+        self._put(_Job(job, outcome), expected_us)
         return outcome
 
     def post(self, job: Callable[[], object]) -> None:
         """Do this too, in its turn, without anybody waiting for it: never refused, so for ending things only."""
-        self._put(_Job(job, None))
+        self._put(_Job(job, None), 0.0)
 
-    def close(self) -> None:
-        """Finish what was queued and end the thread."""
+    def close(self, timeout_s: float | None = None) -> None:
+        """Finish what was queued and end the thread; one that is stuck for longer is left to die with the process."""
         self._jobs.put(None)
-        self._thread.join()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            _log.error("a job did not end within %g s", timeout_s)
 
-    def _put(self, job: _Job) -> None:
+    def _put(self, job: _Job, expected_us: float) -> None:
+        self._expected_us.append(expected_us)
         self._taken += 1
         self._jobs.put(job)
 

@@ -69,6 +69,7 @@ REQUESTS: dict[str, dict[str, Any]] = {
         "frame_budget_us": 25.0,
         "budgets_us": [20.0, 1e9],
         "target_costs_us": [0.25, 18.0],
+        "deadline_us": 1e9,
     },
     "submit_features": {**_SUBMIT, "values": [[10.0, 1.0, 8.5, 9.5], [0.1]]},
     "submit_features_failed": {
@@ -89,8 +90,10 @@ REQUESTS: dict[str, dict[str, Any]] = {
         "budgets_us": [23.5, 19.0],
         "target_costs_us": [0.25, 18.0],
         "hidden": True,
+        "deadline_us": 8000.0,
     },
     "take_turn_replayed": {**_TURN, "replayed_returns_to_go": [99.5, 0.1]},
+    "submit_features_deadline": {**_SUBMIT, "values": [[10.0, 1.0, 8.5, 9.5], [0.1]], "deadline_us": 8000.0},
     "stop_bots": {"type": "stop_bots", "bots": _BOTS},
     "goodbye": {"type": "goodbye"},
 }
@@ -112,6 +115,7 @@ _WELCOME = {
     **_SERVED,
     "replay_frames": 58,
     "target_return": 100.0,
+    "deadline_us": None,
 }
 REPLIES: dict[str, dict[str, Any]] = {
     "welcome": _WELCOME,
@@ -122,9 +126,37 @@ REPLIES: dict[str, dict[str, Any]] = {
         "cost_quantile": None,
         **_NO_VERSION,
         "replay_frames": 1,
+        "deadline_us": 16000.0,
     },
     "bots_started": {"type": "bots_started", "bots": _BOTS, **_SERVED},
-    "queries": {"type": "queries", "frame": 7, "queries": _QUERIES, "cost_us": [23.5, 17.5], "infer_us": 80.25},
+    "queries": {
+        "type": "queries",
+        "frame": 7,
+        "queries": _QUERIES,
+        "cost_us": [23.5, 17.5],
+        "infer_us": 80.25,
+        "reasons": None,
+        "late": False,
+    },
+    "queries_shed": {
+        "type": "queries",
+        "frame": 7,
+        "queries": [[0] * 10, [0] * 10],
+        "cost_us": [0.0, 0.0],
+        "infer_us": 0.0,
+        "reasons": [7, 7],
+        "late": True,
+    },
+    "actions_late": {
+        "type": "actions",
+        "frame": 7,
+        "actions": [[-0.5, 1.0], [0.25, 0.0]],
+        "reasons": [5, 12],
+        "infer_us": 0.0,
+        "turns": [8, 0],
+        "hidden": None,
+        "late": True,
+    },
     "actions": {
         "type": "actions",
         "frame": 7,
@@ -133,6 +165,7 @@ REPLIES: dict[str, dict[str, Any]] = {
         "infer_us": 120.0,
         "turns": [8, 0],
         "hidden": None,
+        "late": False,
     },
     "actions_hidden": {
         "type": "actions",
@@ -142,6 +175,7 @@ REPLIES: dict[str, dict[str, Any]] = {
         "infer_us": 120.0,
         "turns": [8, 300],
         "hidden": [[1.5, -2.0, 0.25], [0.0, 8.0, -1.0]],
+        "late": False,
     },
     "bots_stopped": {"type": "bots_stopped", "count": 2},
     "farewell": {"type": "farewell"},
@@ -189,6 +223,8 @@ def _refused() -> dict[str, tuple[str, bytes]]:
         "nan_acquire_us": ("NON_FINITE", _pack({**submit, "acquire_us": float("nan")})),
         "over_budget": ("OVER_BUDGET", _pack({**turn, "budgets_us": [1e9, 1.0]})),
         "over_frame_budget": ("OVER_BUDGET", _pack({**turn, "frame_budget_us": 8.5})),
+        "nan_deadline_us": ("NON_FINITE", _pack({**query, "deadline_us": float("nan")})),
+        "negative_deadline_us": ("OUT_OF_RANGE", _pack({**submit, "deadline_us": -1.0})),
         "negative_acquire_us": ("OUT_OF_RANGE", _pack({**submit, "acquire_us": -1.0})),
     }
 

@@ -34,7 +34,7 @@ class Ledger:
     def query(self, bots: list[int], frame: int, free: np.ndarray, rewards: list[float]) -> Queries:
         queries_NM = self.rng.random((len(bots), len(RAYS))) < 0.1
         self.turns.append({"frame": frame, "bots": bots, "free": free, "rewards": rewards, "queries": queries_NM})
-        return Queries(frame, queries_NM, np.zeros(len(bots)), 1.0)
+        return Queries(frame, queries_NM, np.zeros(len(bots)), 1.0, np.zeros(len(bots), dtype=np.uint8))
 
     def act(self, bots: list[int], frame: int, acquired: np.ndarray, costly: np.ndarray) -> Actions:
         assert bots == self.turns[-1]["bots"]

@@ -156,11 +156,12 @@ def test_the_client_writes_requests_byte_for_byte() -> None:
     client.act(**_submission(VECTORS["submit_features_failed"]))
     client.act(**_submission(VECTORS["submit_features_measured"]))
     client.act(**_submission(VECTORS["submit_features_hidden"]))
+    client.act(**_submission(VECTORS["submit_features_deadline"]), deadline_us=8000)
     client.stop(BOTS)
     client.close()
     names = ["hello", "hello_cost_model_token", "hello_bundle", "start_bots", "start_bots_all", "start_bots_turns"]
     names += ["submit_features", "submit_features_failed", "submit_features_measured"]
-    names += ["submit_features_hidden", "stop_bots", "goodbye"]
+    names += ["submit_features_hidden", "submit_features_deadline", "stop_bots", "goodbye"]
     assert recorder.sent == [VECTORS[name].body for name in names]
 
 
@@ -170,6 +171,7 @@ def test_the_client_writes_whole_turns_byte_for_byte(name: str) -> None:
     said = VECTORS[name].message
     optional = {key: said.get(key) for key in ("rewards", "frame_budget_us", "budgets_us", "target_costs_us")}
     optional["replayed_returns_to_go"] = said.get("replayed_returns_to_go")
+    optional["deadline_us"] = said.get("deadline_us")
     client.take(free=said["free"], **_submission(VECTORS[name]), **optional)
     assert recorder.sent[-1] == VECTORS[name].body
 

@@ -51,7 +51,7 @@ def test_a_stuck_worker_is_not_ready_and_the_probes_go_on(
     with serve(bundle, tmp_path / "s") as served, RawStream(served.addresses["tcp"]) as waiting:
         http = served.addresses["http"]
         ready = http_request(http, "GET", "/readyz")
-        checks = {"drain": "ok", "bundle": "ok", "worker": "ok"}
+        checks = {"drain": "ok", "bundle": "ok", "breaker": "ok", "worker": "ok"}
         assert (ready.status, json.loads(ready.body)) == (200, {"status": "ready", "checks": checks})
         try:
             waiting.socket.sendall(VECTORS["hello"].frame)

@@ -1,0 +1,79 @@
+"""How long work of a size takes, from what it took lately: a high quantile to plan by, and what is usual.
+
+This module knows nothing about what the work is. Sizes that share a power of two share what is known of them.
+"""
+
+from __future__ import annotations
+
+import threading
+from bisect import insort
+from collections import deque
+from collections.abc import Callable
+
+__all__ = ["Durations"]
+
+_RECENT = 32  # measurements that a prediction is made of
+_RECENT_NS = 10**9  # what is older says nothing of the machine as it is now, and a stall must be forgotten
+_USUAL_STEP = 1.02  # a median that follows by 2 % a measurement: one outlier moves it no more than that
+
+
+class Durations:
+    """Measured µs by size, from any thread. `clock` counts ns, is monotonic, and says when something was measured."""
+
+    def __init__(self, clock: Callable[[], int]) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._by_magnitude: dict[int, _Measured] = {}
+
+    def observe(self, size: int, us: float) -> None:
+        """What work of this size has just taken."""
+        magnitude = size.bit_length()
+        with self._lock:
+            if magnitude not in self._by_magnitude:
+                self._by_magnitude[magnitude] = _Measured(us)
+            self._by_magnitude[magnitude].add(self._clock(), us)
+
+    def predicted_us(self, size: int) -> float:
+        """What nine in ten took at most in the last second, of this size or, where there were none, a smaller one.
+
+        0 where nothing was measured lately: then only trying tells.
+        """
+        now = self._clock()
+        with self._lock:
+            for magnitude in range(size.bit_length(), -1, -1):
+                measured = self._by_magnitude.get(magnitude)
+                predicted_us = measured.predicted_us(now) if measured is not None else 0.0
+                if predicted_us:
+                    return predicted_us
+        return 0.0
+
+    def usual_us(self, size: int) -> float | None:
+        """The median of all that was ever measured of this size; None where nothing was."""
+        measured = self._by_magnitude.get(size.bit_length())
+        return None if measured is None else measured.usual_us
+
+
+class _Measured:
+    """What is known of one magnitude."""
+
+    def __init__(self, us: float) -> None:
+        self.usual_us = us
+        self._recent: deque[tuple[int, float]] = deque()
+        self._sorted: list[float] = []
+
+    def add(self, now_ns: int, us: float) -> None:
+        self.usual_us *= _USUAL_STEP if us > self.usual_us else 1 / _USUAL_STEP
+        if len(self._recent) == _RECENT:
+            self._drop()
+        self._recent.append((now_ns, us))
+        insort(self._sorted, us)
+
+    def predicted_us(self, now_ns: int) -> float:
+        while self._recent and now_ns - self._recent[0][0] > _RECENT_NS:
+            self._drop()
+        n_recent = len(self._sorted)
+        return self._sorted[n_recent - 1 - n_recent // 10] if n_recent else 0.0
+
+    def _drop(self) -> None:
+        _, us = self._recent.popleft()
+        self._sorted.remove(us)

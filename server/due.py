@@ -1,0 +1,117 @@
+"""Deadlines at the desk: who is refused because there is no time, who is answered when it is up, and who is told late.
+
+This module knows nothing about bots or sockets. It runs on the event loop's thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+
+from msgspec.structs import replace
+
+from bot_runtime.deadline import Deadline
+from bot_runtime.durations import Durations
+from protocol import codec
+from protocol.codec import Format
+from protocol.errors import NotReady
+from protocol.messages import MAX_DEADLINE_US, Actions, Queries
+from server.answer import Answer, refusal
+from server.worker import Worker
+from server.written import written
+
+__all__ = ["Due"]
+
+_Kind = type[object]
+_TICK_US = 1000.0  # the event loop's timers count whole ms, and may be early by one
+
+
+class Due:
+    """Deadlines of requests that one worker answers. `default_us` is that of a request that names none.
+
+    `clock` counts ns and is monotonic. Counters only grow: `n_refused` for want of time, `n_timed_out` answered by the
+    event loop while the work went on, `n_late` that left late.
+    """
+
+    def __init__(
+        self, worker: Worker, *, default_us: float | None = None, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._worker = worker
+        self._default_us = default_us
+        self._clock = clock
+        self._took: dict[_Kind, Durations] = {}
+        self._round_ns: int | None = None
+        self.n_refused = self.n_timed_out = self.n_late = 0
+
+    def of(self, asked_us: float | None, received_ns: int) -> Deadline | None:
+        """The deadline of a request, if it has any; one that is not legal is refused by the handlers.
+
+        Requests that the event loop finds together have all been waiting since it found the first.
+        """
+        limit_us = self._default_us if asked_us is None else asked_us
+        if limit_us is None or not 0.0 <= limit_us <= MAX_DEADLINE_US:
+            return None
+        if self._round_ns is None:
+            self._round_ns = received_ns
+            asyncio.get_running_loop().call_soon(self._end_round)
+        return Deadline(min(received_ns, self._round_ns), limit_us, self._clock)
+
+    def expected_us(self, kind: _Kind, size: int) -> float:
+        """What a request of this kind and size is expected to take, all in all; 0 where nothing is known."""
+        return self._took[kind].predicted_us(size) if kind in self._took else 0.0
+
+    def observe(self, kind: _Kind, size: int, took_us: float) -> None:
+        """One has taken so long. May be called from the worker's thread."""
+        self._took.setdefault(kind, Durations(self._clock)).observe(size, took_us)
+
+    def refusal_of(self, deadline: Deadline, expected_us: float, form: Format) -> Answer | None:
+        """The refusal of a request that would wait for too long, if it would."""
+        wait_us = self._worker.backlog_us
+        if wait_us == 0.0 or deadline.left_us() >= wait_us + expected_us:
+            return None  # without a queue it is begun at once, and its bots at least fall back
+        self.n_refused += 1
+        busy = f"{wait_us:.0f} us of work are waiting already, the deadline leaves {deadline.left_us():.0f}"
+        return refusal(NotReady(busy, retry_after_s=wait_us / 1e6), form)
+
+    def kept(self, deadline: Deadline, answered: Answer, form: Format) -> Answer:
+        """The answer as it leaves now: one that is late says so."""
+        reply = answered.reply
+        if not deadline.is_over or not isinstance(reply, Queries | Actions):
+            return answered
+        self.n_late += 1
+        reply = replace(reply, late=True)
+        return Answer(reply, codec.encode(reply, form), answered.status)
+
+    def watched(self, deadline: Deadline, working: asyncio.Future[Answer], form: Format) -> asyncio.Future[Answer]:
+        """What the work answers or, when that takes too long, what was offered instead."""
+        loop = working.get_loop()
+        answered: asyncio.Future[Answer] = loop.create_future()
+        left_us = deadline.left_us()
+        # Less than a tick is not worth a timer: the worker itself falls back when it is too late.
+        timer = loop.call_later(left_us // _TICK_US / 1e3, self._expire, deadline, answered, form)
+        if left_us < _TICK_US:
+            timer.cancel()
+
+        def finish(done: asyncio.Future[Answer]) -> None:
+            timer.cancel()
+            if not answered.done():
+                answered.set_result(self.kept(deadline, done.result(), form))
+
+        working.add_done_callback(finish)
+        return answered
+
+    def _expire(self, deadline: Deadline, answered: asyncio.Future[Answer], form: Format) -> None:
+        if answered.done() or not deadline.expire():
+            return
+        if deadline.fallback is None:
+            self.n_refused += 1
+            unbegun = NotReady("the deadline passed before the request was begun", retry_after_s=0.1)
+            answered.set_result(refusal(unbegun, form))
+            return
+        self.n_timed_out += 1
+        reply = written(deadline.fallback, form)
+        answered.set_result(self.kept(deadline, Answer(reply, codec.encode(reply, form), 200), form))
+
+    def _end_round(self) -> None:
+        self._round_ns = None
