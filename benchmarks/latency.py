@@ -33,7 +33,7 @@ from protocol.client import BotClient
 
 __all__ = ["Latency", "main", "measure"]
 
-_DOORS = {"uds": "unix", "tcp": "tcp", "http": "http"}
+_DOORS = {"uds": "unix", "tcp": "tcp", "ws": "ws", "http": "http"}
 _WARM_UP = 20
 _ROUND = 50  # turns of one transport before the next has its turn
 _QUANTILES = {"p50_us": 50.0, "p99_us": 99.0, "p999_us": 99.9}

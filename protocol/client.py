@@ -1,4 +1,4 @@
-"""BotClient: the blocking client that clients in other languages follow, over HTTP, TCP or a Unix socket.
+"""BotClient: the blocking client that clients in other languages follow, over HTTP, WebSocket, TCP or a Unix socket.
 
 This module knows nothing about bots or how the server reads what it sends: it packs and unpacks with the `msgpack`
 package, plain dicts and numpy, on purpose not with `protocol.codec`. Shape letters as in `protocol.features`.
@@ -32,7 +32,7 @@ __all__ = ["Actions", "BotClient", "Queries", "ReplyError", "Welcome"]
 
 
 class BotClient:
-    """One connection to a server at `http://host:port`, `tcp://host:port` or `unix:///path`.
+    """One connection to a server at `http://host:port`, `ws://host:port`, `tcp://host:port` or `unix:///path`.
 
     Every method raises the ProtocolError of the server's answer; OSError (TimeoutError, ConnectionError, ReplyError)
     where there is none. A socket that failed is closed: over HTTP the next call opens another and the connection goes

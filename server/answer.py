@@ -23,8 +23,8 @@ _log = logger(__name__)
 
 
 class Arrival(NamedTuple):
-    """By which transport a request came (`http`, `tcp`, `unix`), when it was whole (ns of the monotonic clock) and by
-    when it is to be answered, if that is said."""
+    """By which transport a request came (`http`, `ws`, `tcp`, `unix`), when it was whole (ns of the monotonic clock)
+    and by when it is to be answered, if that is said."""
 
     transport: str
     received_ns: int

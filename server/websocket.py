@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from typing import cast
 
+from websockets.exceptions import PayloadTooBig
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request, Response
 from websockets.protocol import State
@@ -20,7 +21,7 @@ from websockets.server import ServerProtocol
 from websockets.typing import Origin
 
 from protocol.codec import Format
-from protocol.errors import TooManyConnections
+from protocol.errors import ProtocolError, TooLarge, TooManyConnections
 from protocol.transport import SOCKET_PATH
 from server.conversation import Conversation
 from server.sockets import Sockets
@@ -67,6 +68,8 @@ class WebSocket(Conversation):
                 self._accept(event)
             elif isinstance(event, Frame):
                 self._take(event)
+        if isinstance(self._protocol.parser_exc, PayloadTooBig):
+            self._count_refused(TooLarge)
         self._is_within_frame = not events or bool(self._protocol.reader.buffer)
         self._flush()
 
@@ -94,6 +97,7 @@ class WebSocket(Conversation):
         try:
             self._sockets.add(self)
         except TooManyConnections as error:
+            self._count_refused(TooManyConnections)
             return self._protocol.reject(HTTPStatus.SERVICE_UNAVAILABLE, f"{error.detail}\n")
         return self._protocol.accept(request)
 
@@ -109,6 +113,9 @@ class WebSocket(Conversation):
             if frame.fin:
                 self._bodies.append(bytes(self._fragments))
                 self._fragments = None
+
+    def _count_refused(self, error: type[ProtocolError]) -> None:
+        self._sockets.desk.handlers.recorder.refused(self.name, error.code)
 
     def _say_goodbye(self, code: CloseCode) -> None:
         if self._protocol.state is State.OPEN:
