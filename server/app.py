@@ -11,7 +11,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import uvicorn
 
@@ -26,6 +26,7 @@ from server.due import Due
 from server.exchange import Exchange
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
+from server.metrics import Metrics
 from server.observation import watch
 from server.probes import Probes
 from server.probing import probing
@@ -38,6 +39,9 @@ from server.store import Store
 from server.stream import StreamSocket
 from server.websocket import web_socket
 from server.worker import Worker
+
+if TYPE_CHECKING:  # an extra, imported where it is asked for
+    from server.telemetry import Telemetry
 
 __all__ = ["running"]
 
@@ -69,6 +73,8 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             idle_ttl_s=settings.idle_ttl_s,
         )
         readiness, metrics = watch(settings, handlers, connections, worker, sockets)
+        if settings.otlp_endpoint is not None:
+            stack.callback(_telemetry(metrics, settings.otlp_endpoint, settings.otlp_every_s).close)
         rest = create_app(HttpDoor(handlers, worker), Probes(handlers, readiness, metrics))
         add_routes(rest, admin)
         application = Exchange(desk, rest, body_deadline_s=settings.frame_deadline_s)
@@ -88,6 +94,15 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
         finally:
             readiness.is_draining = True
             uvicorn_server.should_exit = True  # drains in its own task while the streams are drained here
+
+
+def _telemetry(metrics: Metrics, endpoint: str, every_s: float) -> Telemetry:
+    """Raises ValueError where the extra is not installed."""
+    try:
+        from server.telemetry import Telemetry
+    except ImportError as error:
+        raise ValueError(f"--otlp-endpoint needs the extra `telemetry` ({error})") from error
+    return Telemetry(metrics, endpoint, every_s)
 
 
 def _filled(servings: Servings, worker: Worker, settings: Settings) -> Catalogue | None:

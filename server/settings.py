@@ -73,6 +73,11 @@ class Settings:
     it, so that the front knows where each of them is held."""
     log_json: bool | None = None
     """Log lines of JSON, or of text; by default JSON unless a terminal is watching."""
+    otlp_endpoint: str | None = None
+    """URL of an OpenTelemetry collector's metrics, such as http://127.0.0.1:4318/v1/metrics: what /metrics says is sent
+    there too. Needs the extra `telemetry`."""
+    otlp_every_s: float = 15.0
+    """How often."""
     ready_file: Path | None = None
     """Written once everything listens: JSON of the addresses (`http`, `ws`, `tcp`, `unix`) and `pid`. Removed at the
     end."""
@@ -84,6 +89,10 @@ class Settings:
             raise ValueError("max_bots, max_connections, max_queue and max_loaded must be at least 1")
         if min(self.idle_ttl_s, self.frame_deadline_s, self.stuck_after_s, self.drain_s) <= 0:
             raise ValueError("idle_ttl_s, frame_deadline_s, stuck_after_s and drain_s must be positive")
+        if self.otlp_endpoint is not None and not self.otlp_endpoint.startswith(("http://", "https://")):
+            raise ValueError(f"otlp_endpoint is {self.otlp_endpoint[:200]!r}, expected a URL")
+        if not self.otlp_every_s >= 0.01:
+            raise ValueError(f"otlp_every_s is {self.otlp_every_s}, expected at least 0.01")
         if not self.inline_us >= 0:
             raise ValueError("inline_us must not be negative")
         if self.process is not None and not _PROCESS.fullmatch(self.process):

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from protocol.client import BotClient
+from protocol.errors import NoBot
 from tests.bundles import make_bundle
 from tests.server.serving import costly_numbers, free_numbers, serve
 from tests.server.test_metrics import Scrape
@@ -43,9 +44,10 @@ def scraped(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         bots = client.start(2)
         queries = client.query(bots, 0, free_numbers(table, 2, 0))
         client.act(bots, 0, queries.queries, costly_numbers(table, 2, 0), acquire_us=5.0)
-        with BotClient(served.addresses["http"]) as other, pytest.raises(Exception, match="NO_BOT"):
+        with BotClient(served.addresses["http"]) as other:
             other.hello()
-            other.query(bots, 1, free_numbers(table, 2, 1))
+            with pytest.raises(NoBot):
+                other.query(bots, 1, free_numbers(table, 2, 1))
         samples = Scrape(served).samples
     labels: dict[str, set[str]] = {}
     for sample in samples:
