@@ -65,9 +65,9 @@ class Means:
         query_NM, cost_us_N = sampled_NM, self.cost_us(sampled_NM)
         fits_N = cost_us_N <= self.ample_N
         if frame_budget_us is None:
-            rows = np.flatnonzero(~fits_N)
-            if rows.size == 0:
+            if np.count_nonzero(fits_N) == fits_N.size:
                 return query_NM, cost_us_N
+            rows = np.flatnonzero(~fits_N)
             rest = (costs_NM[rows], calls_N[rows], budgets_N[rows])
             query_NM[rows] = allocate(probs_NM[rows], sampled_NM[rows], *rest)
         elif not (fits_N.all() and cost_us_N.sum() <= frame_budget_us * _AMPLE):

@@ -34,10 +34,25 @@ def uniforms(seeds_N: NDArray[np.uint64], turns_N: NDArray[np.int64], count: int
 
     Row n depends on its own seed and turn only, and a longer row starts with the shorter one.
     """
-    streams_N = mix(np.asarray(seeds_N, dtype=np.uint64) + _GOLDEN)
-    rows_N = mix(streams_N + np.asarray(turns_N).astype(np.uint64) * _GOLDEN)
-    indices = np.arange(1, count + 1, dtype=np.uint64) * _GOLDEN
-    bits = mix(rows_N[:, None] + indices[None, :])
+    return _numbers(_streams(seeds_N), np.asarray(turns_N), _indices(count))
+
+
+def _streams(seeds_N: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    return mix(np.asarray(seeds_N, dtype=np.uint64) + _GOLDEN)
+
+
+def _indices(count: int) -> NDArray[np.uint64]:
+    return np.arange(1, count + 1, dtype=np.uint64) * _GOLDEN
+
+
+def _numbers(
+    streams_N: NDArray[np.uint64], turns: NDArray[np.int64], indices: NDArray[np.uint64]
+) -> NDArray[np.float32]:
+    """Of turns [..., N]: [..., N, count]."""
+    rows = turns.astype(np.uint64)
+    rows *= _GOLDEN
+    rows += streams_N
+    bits = mix(np.add.outer(mix(rows), indices))
     bits >>= np.uint64(40)
     numbers = bits.astype(np.float32)
     numbers *= _FLOAT32_STEP
@@ -48,16 +63,17 @@ class Noise:
     """The noise of N bots, turn by turn; of a few bots some turns ahead, for that costs hardly more than one."""
 
     def __init__(self, seeds_N: NDArray[np.uint64], count: int) -> None:
-        self._seeds_N, self._count = seeds_N, count
+        self._streams_N, self._indices = _streams(seeds_N), _indices(count)
         self._ahead = max(1, _AHEAD // seeds_N.size)
         self._rows: dict[bytes, NDArray[np.float32]] = {}  # by the turns
 
     def at(self, turns_N: NDArray[np.int64]) -> NDArray[np.float32]:
         """`uniforms` of these turns, shape [N, count]."""
+        if self._ahead == 1:
+            return _numbers(self._streams_N, turns_N, self._indices)
         key = turns_N.tobytes()
         if key not in self._rows:
             turns_TN = turns_N + np.arange(self._ahead)[:, None]
-            seeds = np.tile(self._seeds_N, self._ahead)
-            block = uniforms(seeds, turns_TN.ravel(), self._count).reshape(*turns_TN.shape, self._count)
+            block = _numbers(self._streams_N, turns_TN, self._indices)
             self._rows = {turns.tobytes(): rows for turns, rows in zip(turns_TN, block, strict=True)}
         return self._rows[key]
