@@ -1,4 +1,4 @@
-"""How long does a turn take? In process, over a Unix socket, TCP and HTTP, for 1 to 256 bots.
+"""How long does a turn take? In process, over a Unix socket, TCP, WebSocket and HTTP, for 1 to 256 bots.
 
 A turn is one RequestQueries and one SubmitFeatures for all N bots: two round trips where there is a wire, without what
 the engine does between them. *Model* is the time in the two ONNX graphs (the replies' `infer_us`); what is left is
