@@ -14,10 +14,11 @@ from typing import TypeVar
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
 
+from server.due import Due
 from server.recorder import BATCH_BOUNDS, NS_BOUNDS, PHASES, WHOLE, Recorder
 from server.serving import Serving
 
-__all__ = ["bundles", "gauge", "readiness", "requests", "sockets"]
+__all__ = ["bundles", "deadlines", "gauge", "readiness", "requests", "sockets"]
 
 Labels = TypeVar("Labels", bound=tuple[str, ...])
 _SECONDS = [f"{bound / 1e9:g}" for bound in NS_BOUNDS]
@@ -83,11 +84,14 @@ def bundles(servings: Iterable[Serving]) -> Iterator[Metric]:
     yield gauge("bots", "Bots.", _BUNDLE, summed("n_bots"))
     held = {key: sum(each.n_connections for each in group) for key, group in by_bundle.items()}
     yield gauge("bundle_connections", "Connections that hold a bundle.", _BUNDLE, held)
-    rungs: Counter[tuple[str, ...]] = Counter()
-    for key, group in by_bundle.items():
-        for each in group:
-            rungs.update({(*key, reason.name.lower()): n for reason, n in each.bots.counters.reasons.items()})
-    yield _counter("actions", "Actions by the rung of the fallback ladder.", (*_BUNDLE, "reason"), rungs)
+    rungs = {"queries": "query_reasons", "actions": "reasons"}
+    for name, counted in rungs.items():
+        numbers: Counter[tuple[str, ...]] = Counter()
+        for key, group in by_bundle.items():
+            for each in group:
+                by_reason = getattr(each.bots.counters, counted)
+                numbers.update({(*key, reason.name.lower()): n for reason, n in by_reason.items()})
+        yield _counter(name, f"Bots' {name} by the rung of the fallback ladder.", (*_BUNDLE, "reason"), numbers)
     skipped, abandoned = summed("skipped_frames", "counters"), summed("abandoned_queries", "counters")
     yield _counter("skipped_frames", "Frame numbers that a bot never saw.", _BUNDLE, skipped)
     yield _counter("abandoned_queries", "Pending queries that a newer frame replaced.", _BUNDLE, abandoned)
@@ -96,6 +100,12 @@ def bundles(servings: Iterable[Serving]) -> Iterator[Metric]:
         yield _counter(f"{name}_seconds", help_text, _BUNDLE, in_s)
     for number, (name, help_text) in _COUNTED.items():
         yield _counter(name, help_text, _BUNDLE, summed(number, "spent"))
+
+
+def deadlines(due: Due) -> Iterator[Metric]:
+    """Requests that their deadline was too short for, by what became of them."""
+    became = {("refused",): due.n_refused, ("timed_out",): due.n_timed_out, ("late",): due.n_late}
+    yield _counter("deadlines_missed", "Requests whose deadline was too short.", ("outcome",), became)
 
 
 def readiness(names: Sequence[str], failing: Mapping[str, str]) -> Iterator[Metric]:

@@ -42,6 +42,7 @@ def watch(
     metrics.register(partial(families.requests, handlers.recorder))
     metrics.register(lambda: families.bundles(handlers.servings))
     metrics.register(partial(_saturation, settings, connections, worker))
+    metrics.register(partial(families.deadlines, sockets.desk.due))
     metrics.register(lambda: families.sockets(sockets.by_transport()))
     metrics.register(lambda: families.readiness(readiness.names, readiness.failing()))
     return Observation(readiness, metrics)

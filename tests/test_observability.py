@@ -111,3 +111,11 @@ def test_prometheus_takes_the_configuration() -> None:
         [promtool, "check", "config", str(PROMETHEUS / "prometheus.yml")], capture_output=True, text=True, check=False
     )
     assert checked.returncode == 0, checked.stderr
+
+
+def test_the_reference_lists_every_metric_and_no_other(scraped: dict[str, set[str]]) -> None:
+    text = (ROOT / "docs" / "operations.md").read_text()
+    table = text[text.index("| metric | labels |") : text.index("Counting takes")]
+    documented = {name for row in table.splitlines() for name in re.findall(r"`((?:bot_runtime)_\w+)`", row)}
+    counted = {re.sub(r"_(bucket|count|sum)$", "", name) for name in scraped if name.startswith("bot_runtime_")}
+    assert documented == counted

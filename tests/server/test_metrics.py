@@ -63,6 +63,8 @@ def test_what_happened_is_what_it_says(server: Served, door: str) -> None:
         assert scrape("message_bots_bucket", message="submit_features", le="2") == 0
         assert scrape("actions_total", bundle="tiny", reason="learned") == 4 * N
         assert scrape("actions_total", reason="non_finite_step_safe_action") == 0
+        assert scrape("queries_total", reason="learned") == 6 * N
+        assert scrape("deadlines_missed_total", outcome="late") == 0
         assert scrape("refused_total", transport=door, code="NO_BOT") == 1
         assert scrape("skipped_frames_total") == N * (3 + 1)
         assert scrape("abandoned_queries_total") == N
