@@ -79,7 +79,7 @@ def _greedy_rows(wishes: Wishes, limits_R: _Floats) -> _Bools:
     ranked = wishes.ranked()
     left_RW, costs_RW = ranked.asked_NW.copy(), ranked.costs_NW
     limits_R1, spent_R1 = limits_R[:, None], wishes.calls_N[:, None]
-    taken_RW = np.zeros_like(left_RW)
+    taken_RW, rows_R = np.zeros_like(left_RW), np.arange(limits_R.size)
     for _ in range(MAX_PASSES):
         left_RW &= spent_R1 + costs_RW <= limits_R1
         if not left_RW.any():
@@ -88,8 +88,8 @@ def _greedy_rows(wishes: Wishes, limits_R: _Floats) -> _Bools:
         np.cumsum(running_RW, axis=1, out=running_RW)
         running_RW += spent_R1
         fits_RW = running_RW <= limits_R1
-        last_R1 = fits_RW.sum(axis=1)[:, None] - 1
-        spent_R1 = np.where(last_R1 < 0, spent_R1, np.take_along_axis(running_RW, last_R1, axis=1))
+        last_R = fits_RW.sum(axis=1) - 1
+        spent_R1 = np.where(last_R < 0, spent_R1[:, 0], running_RW[rows_R, last_R])[:, None]
         fits_RW &= left_RW
         taken_RW |= fits_RW
         left_RW ^= fits_RW
