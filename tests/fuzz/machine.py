@@ -175,10 +175,8 @@ class ServerMachine(RuleBasedStateMachine):
         """A frame as it should be."""
         self.turn(which, 0, abs(step), content, None, False, True)
 
-    @rule(which=PLACES, by=BY, step=STEPS, content=CONTENTS, spoilt=SPOILT, taken=st.booleans(), submits=st.booleans())
-    def turn(
-        self, which: int, by: int, step: int, content: int, spoilt: str | None, taken: bool, submits: bool
-    ) -> None:
+    @rule(which=PLACES, by=BY, step=STEPS, content=CONTENTS, spoilt=SPOILT, taken=st.booleans(), ends=st.booleans())
+    def turn(self, which: int, by: int, step: int, content: int, spoilt: str | None, taken: bool, ends: bool) -> None:
         """All bots of this bot's connection, in their order."""
         bot = _recent(list(self.owner), which)
         link, number = self.model.links.get(self.owner[bot]), self.at(step)
