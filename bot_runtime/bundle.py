@@ -88,6 +88,7 @@ def _verify_behaviour(bundle: Bundle, golden: bytes, *, with_replay: bool, clock
     policy = Policy(bundle)
     try:
         _probe_latency(policy, bundle.manifest, clock)
+        policy.check_prepared()
         if with_replay:
             replay(policy, bundle.manifest, recorded)
     except BadBundle:

@@ -52,10 +52,10 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     `budget` is the normalised C of the paper, in [0, 1]; 1 means unconstrained. `context_length` 1 means no context at
     all: a network without memory, whose layers, heads and width are 0. `prepared_width` is how many numbers the
-    acquisition graph hands on to the action graph, `samples_action` says that the latter reads noise. `target_cost` is
-    the share of the full cost that a budget-conditioned network is asked for by default; None, and the network has no
-    such input. `tolerance` is the largest |Δ| that the golden replay accepts. `precision` is that of the graphs' large
-    matrix products.
+    acquisition graph hands on to the action graph, none of which depends on the hidden state; `samples_action` says
+    that the latter reads noise. `target_cost` is the share of the full cost that a budget-conditioned network is asked
+    for by default; None, and the network has no such input. `tolerance` is the largest |Δ| that the golden replay
+    accepts. `precision` is that of the graphs' large matrix products.
     """
 
     schema_version: Literal[2]

@@ -78,6 +78,19 @@ class Policy:
             run = batch.runs["action"] = _bound(self._action, *action_arrays(self._manifest, batch))
         run()
 
+    def check_prepared(self) -> None:
+        """Raises BadBundle where what is prepared depends on the hidden state. Every turn would then be felt for ever,
+        and no number of last turns would rebuild a context.
+        """
+        inputs, _ = _acquisition_ports(self._manifest)
+        prepared = []
+        for hidden in (0.0, 1.0):
+            feed = {name: np.zeros(_sized(shape, 1), np.float32) for name, (_, shape) in inputs.items()}
+            feed["before"][:, : self._manifest.width] = hidden
+            prepared += self._acquisition.session.run(["prepared"], feed)
+        if prepared[0].tobytes() != prepared[1].tobytes():
+            raise BadBundle("prepared depends on the hidden state in before, expected on the other numbers only")
+
     def check_batch(self, n_bots: int) -> None:
         """Run both graphs on zeros. Raises BadBundle where an output is not of the manifest's shape for so many bots.
 

@@ -1,6 +1,6 @@
 """The two graphs of a tiny bundle, random weights and all: real ONNX, real causal attention where it has a context.
 
-Every output depends on every input.
+Every output depends on every input, but for what is prepared, which must not depend on the hidden state.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ def acquisition_graph(manifest: Manifest, seed: int) -> bytes:
     scale = np.concatenate([np.ones(width), 1.0 / np.maximum(np.abs(table.free_range[1]), 1.0), [0.1]])
     x, columns = graph.scaled("before", scale.size, scale), scale.size
     inputs = {"before": ("N", columns)}
-    graph.linear(x, columns, manifest.prepared_width, out="prepared")
+    known = graph.scaled("before", scale.size, np.where(np.arange(scale.size) < width, 0.0, scale))
+    graph.linear(known, columns, manifest.prepared_width, out="prepared")
     if manifest.is_conditioned:
         inputs["target_cost"] = ("N", 1)
         x, columns = graph.op("Concat", x, graph.scaled("target_cost", 1, 3.0), axis=1), columns + 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,9 @@ from bot_runtime.batch import Batch
 from bot_runtime.bundle import Bundle
 from bot_runtime.context import Contexts
 from bot_runtime.policy import Policy
+from protocol.errors import BadBundle
+from tests import graphs
+from tests.bundles import make_bundle
 
 READ = ("prepared_NE", "costly_ND", "query_NM", "noise_NA", "place_N", "memory")
 
@@ -105,4 +110,17 @@ def test_every_input_of_the_acquisition_graph_matters(conditioned: Bundle, name:
     getattr(batch, name)[...] += 1.0
     policy.query_probs(batch)
     changed = np.abs(getattr(batch, output) - before).max() > 1e-3
-    assert changed == (name != "target_cost_N1" or output == "probs_NM")
+    assert changed == (name not in ("target_cost_N1", "past_NW") or output == "probs_NM")
+
+
+def test_what_is_prepared_may_not_depend_on_the_hidden_state(
+    bundle: Bundle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Else a turn would be felt for ever, and a context could not be rebuilt."""
+    Policy(bundle).check_prepared()
+    scaled = graphs._Graph.scaled
+    monkeypatch.setattr(
+        graphs._Graph, "scaled", lambda self, x, columns, scale: scaled(self, x, columns, np.where(scale, scale, 1.0))
+    )
+    with pytest.raises(BadBundle, match="prepared depends on the hidden state"):
+        Bundle.load(make_bundle(tmp_path))

@@ -1,0 +1,315 @@
+"""ResumingClient: a BotClient whose bots outlive their server.
+
+This module knows nothing about what a message looks like. Whatever ends the connection (the server's death, a cut line,
+too long a silence), the next request opens another, starts the bots anew, replays the turns that their contexts consist
+of (PROTOCOL.md, *Resume*), and goes on: the caller sees one answer, and that of a run without interruption.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, NamedTuple, Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from protocol.client import BotClient
+from protocol.errors import NoBot, NoConnection, NotReady, TooManyBots, TooManyConnections
+from protocol.features import CostModel
+from protocol.history import Asked, Bot, History, Taken
+from protocol.replies import Actions, Queries, Welcome
+from protocol.transport import ReplyError
+
+__all__ = ["ResumingClient"]
+
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.005, 0.25
+_BUSY = (NotReady, TooManyBots, TooManyConnections)  # a server that starts, or that has not missed us yet
+_MAX_COMPANIES = 256  # bots that were named together, and whose last turn is remembered
+T = TypeVar("T")
+
+
+class _Turn(NamedTuple):
+    """The last turn of some bots, what was answered, and how often the client had resumed by then."""
+
+    asked: Asked
+    resumed: int
+    queries: Queries | None = None
+    actions: Actions | None = None
+
+
+class ResumingClient:
+    """The interface of BotClient. Bots are named by numbers of this client's own, which stay while handles change.
+
+    A request without an answer is repeated for at most `limit_s` before it raises what a BotClient would have. NoBot
+    is raised where bots cannot be resumed, for another bundle is served. Costs that the server learned are learned
+    again, from the `cost_model` of `hello` and the turns that are replayed. `resumed` counts how often all this was so.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        timeout_s: float = 5.0,
+        limit_s: float = 30.0,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self._client = BotClient(url, timeout_s=timeout_s)
+        self._limit_s, self._clock, self._sleep = limit_s, clock, sleep
+        self._said: dict[str, Any] | None = None
+        self._welcome: Welcome | None = None
+        self._history = History(1)
+        self._handles: dict[int, int] = {}
+        self._turns: dict[tuple[int, ...], _Turn] = {}
+        self._next_bot = 0
+        self.resumed = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def welcome(self) -> Welcome:
+        """See BotClient."""
+        if self._welcome is None:
+            raise NoConnection("say hello first")
+        return self._welcome
+
+    def hello(
+        self, *, cost_model: CostModel | None = None, token: str | None = None, bundle: str | None = None
+    ) -> Welcome:
+        """See BotClient. Raises ReplyError for a server that is too old to be told of turns."""
+        self._said = None
+        said = {"cost_model": cost_model, "token": token, "bundle": bundle}
+        self._welcome = self._client.hello(**said)  # type: ignore[arg-type]
+        if self._welcome.replay_frames is None:
+            raise ReplyError("this server cannot resume bots: it is older than this client")
+        self._said, self._history = said, History(self._welcome.replay_frames)
+        self._handles, self._turns = {}, {}
+        return self._welcome
+
+    def start(
+        self,
+        count: int,
+        *,
+        seeds: Sequence[int] | None = None,
+        target_returns: Sequence[float] | None = None,
+        budgets_us: Sequence[float] | None = None,
+        target_costs_us: Sequence[float] | None = None,
+    ) -> NDArray[np.int64]:
+        """See BotClient. Without `seeds` the client draws them, for it has to know them."""
+        drawn = [secrets.randbits(63) for _ in range(count)] if seeds is None else [int(seed) for seed in seeds]
+        limits: dict[str, Any] = {
+            "target_returns": target_returns, "budgets_us": budgets_us, "target_costs_us": target_costs_us
+        }  # fmt: skip
+
+        def start() -> NDArray[np.int64]:
+            return self._client.start(count, seeds=drawn, **limits)
+
+        handles_N = self._through(start, start, repeatable=False)
+        self._welcome = self._client.welcome
+        default = self._welcome.target_return or 0.0
+        numbers = range(self._next_bot, self._next_bot + count)
+        self._next_bot += count
+        for row, number in enumerate(numbers):
+            left, budget_us, target_us = (None if said is None else float(said[row]) for said in limits.values())
+            self._history.bots[number] = Bot(drawn[row], default if left is None else left, budget_us, target_us)
+            self._handles[number] = int(handles_N[row])
+        return np.array(numbers, dtype=np.int64)
+
+    def query(
+        self,
+        bots: ArrayLike,
+        frame: int,
+        free: ArrayLike,
+        rewards: ArrayLike | None = None,
+        frame_budget_us: float | None = None,
+        budgets_us: ArrayLike | None = None,
+        target_costs_us: ArrayLike | None = None,
+    ) -> Queries:
+        """See BotClient."""
+        numbers, earlier = self._numbers(bots), self._before(bots, frame)
+        if earlier is not None and earlier.queries is not None:
+            return earlier.queries
+        limits = {"frame_budget_us": frame_budget_us, "budgets_us": budgets_us, "target_costs_us": target_costs_us}
+        asked = self._history.ask(numbers, frame, free, rewards, limits)
+
+        def ask() -> Queries:
+            return self._client.query(self._now(numbers), frame, free, rewards, **limits)  # type: ignore[arg-type]
+
+        queries = self._through(ask, ask)
+        self._history.count(asked)
+        self._remember(_Turn(asked, self.resumed, queries))
+        return queries
+
+    def act(
+        self,
+        bots: ArrayLike,
+        frame: int,
+        acquired: ArrayLike,
+        costly: ArrayLike,
+        failed: ArrayLike | None = None,
+        acquire_us: float | None = None,
+        hidden: bool = False,
+    ) -> Actions:
+        """See BotClient. If the server that was asked is gone, the next one is told the whole turn, query and all."""
+        numbers, earlier = self._numbers(bots), self._before(bots, frame)
+        if earlier is not None and earlier.actions is not None:
+            return earlier.actions
+        said = {"acquired": acquired, "costly": costly, "failed": failed, "acquire_us": acquire_us}
+        turn = self._turns.get(tuple(numbers))
+
+        def act() -> Actions:
+            return self._client.act(self._now(numbers), frame, hidden=hidden, **said)  # type: ignore[arg-type]
+
+        if turn is None or turn.asked.frame != frame:
+            return self._through(act, act)  # which the server refuses
+        asked = turn.asked
+        now_said = {**said, **asked.limits, "hidden": hidden, "replayed_returns_to_go": asked.left_N}
+
+        def tell() -> Actions:
+            return self._client.take(self._now(numbers), frame, asked.free_NF, **now_said)
+
+        return self._answered(turn, said, self._through(act if earlier is None else tell, tell))
+
+    def take(
+        self,
+        bots: ArrayLike,
+        frame: int,
+        free: ArrayLike,
+        acquired: ArrayLike,
+        costly: ArrayLike,
+        rewards: ArrayLike | None = None,
+        failed: ArrayLike | None = None,
+        acquire_us: float | None = None,
+        frame_budget_us: float | None = None,
+        budgets_us: ArrayLike | None = None,
+        target_costs_us: ArrayLike | None = None,
+        hidden: bool = True,
+    ) -> Actions:
+        """See BotClient."""
+        numbers, earlier = self._numbers(bots), self._before(bots, frame)
+        if earlier is not None and earlier.actions is not None:
+            return earlier.actions
+        said = {"acquired": acquired, "costly": costly, "failed": failed, "acquire_us": acquire_us}
+        limits = {"frame_budget_us": frame_budget_us, "budgets_us": budgets_us, "target_costs_us": target_costs_us}
+        asked = self._history.ask(numbers, frame, free, rewards, limits)
+        now_said = {**said, **limits, "rewards": rewards, "hidden": hidden}
+
+        def take() -> Actions:
+            return self._client.take(self._now(numbers), frame, free, **now_said)  # type: ignore[arg-type]
+
+        actions = self._through(take, take)
+        self._history.count(asked)
+        return self._answered(_Turn(asked, self.resumed), said, actions)
+
+    def stop(self, bots: ArrayLike) -> int:
+        """See BotClient."""
+        numbers = self._numbers(bots)
+
+        def stop() -> int:
+            return self._client.stop(self._now(numbers))
+
+        stopped = self._through(stop, stop, repeatable=False)
+        self._history.forget(numbers)
+        for number in numbers:
+            del self._handles[number]
+        self._turns = {named: turn for named, turn in self._turns.items() if not set(named) & set(numbers)}
+        return stopped
+
+    def close(self) -> None:
+        """See BotClient."""
+        self._said = None
+        self._client.close()
+
+    def _before(self, bots: ArrayLike, frame: int) -> _Turn | None:
+        """The last turn of these bots if it is this frame's and from before the last time that they were resumed."""
+        turn = self._turns.get(tuple(self._numbers(bots)))
+        return turn if turn is not None and turn.asked.frame == frame and turn.resumed != self.resumed else None
+
+    def _answered(self, turn: _Turn, acquired: dict[str, Any], actions: Actions) -> Actions:
+        if actions.turns is not None:
+            self._history.take(turn.asked, acquired, actions.turns)
+        self._remember(turn._replace(resumed=self.resumed, actions=actions))
+        return actions
+
+    def _remember(self, turn: _Turn) -> None:
+        self._turns.pop(turn.asked.bots, None)
+        if len(self._turns) == _MAX_COMPANIES:
+            del self._turns[next(iter(self._turns))]
+        self._turns[turn.asked.bots] = turn
+
+    def _numbers(self, bots: ArrayLike) -> list[int]:
+        numbers: list[int] = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
+        for number in numbers:
+            if number not in self._handles:
+                raise NoBot(f"no bot {number} of this client")
+        return numbers
+
+    def _now(self, numbers: Sequence[int]) -> list[int]:
+        return [self._handles[number] for number in numbers]
+
+    def _through(self, first: Callable[[], T], again: Callable[[], T], *, repeatable: bool = True) -> T:
+        """The answer to `first`, or to `again` once the bots were resumed on another connection.
+
+        A request without an answer is sent again as it is: where the connection lives, that changes nothing unless it
+        is not `repeatable`, and where it does not, the server says so.
+        """
+        if self._said is None:
+            raise NoConnection("say hello first")
+        attempt, lost, give_up_s, pause_s = first, False, float("inf"), _FIRST_PAUSE_S
+        while True:
+            try:
+                if lost:
+                    self._resume(self._said)
+                    attempt, lost = again, False
+                return attempt()
+            except (OSError, NoConnection, *_BUSY) as error:
+                if isinstance(error, _BUSY) and give_up_s == float("inf"):
+                    raise
+                failure = error
+            if lost:
+                self._client.close()  # what was half made ends
+            lost = lost or not repeatable or isinstance(failure, NoConnection)
+            now_s = self._clock()
+            give_up_s = min(give_up_s, now_s + self._limit_s)
+            if now_s >= give_up_s:
+                raise failure
+            self._sleep(pause_s)
+            pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
+
+    def _resume(self, said: dict[str, Any]) -> None:
+        """A new connection with the same bots, their contexts rebuilt. Raises what BotClient does; NoBot."""
+        was, history = self.welcome, self._history
+        if was.bundle_version is not None:
+            said = {**said, "bundle": f"{was.bundle}@{was.bundle_version}"}
+        welcome = self._client.hello(**said)
+        if welcome.bundle_sha256 != was.bundle_sha256 or welcome.features != was.features:
+            raise NoBot("another bundle is served now: the bots cannot be resumed")
+        needed = history.needed()
+        replayed = Counter(number for taken in needed for number in taken.bots)
+        for numbers, arguments in history.groups():
+            turns = [history.bots[number].turns - replayed[number] for number in numbers]
+            handles_N = self._client.start(len(numbers), **arguments, turns=turns)
+            self._handles.update(zip(numbers, handles_N.tolist(), strict=True))
+        self._replay(needed)
+        self._welcome = self._client.welcome
+        self.resumed += 1
+
+    def _replay(self, needed: list[Taken]) -> None:
+        turns: dict[int, int] = {}
+        for taken in needed:
+            actions = self._client.take(self._now(taken.bots), **taken.again(), hidden=False)
+            turns.update(zip(taken.bots, [] if actions.turns is None else actions.turns.tolist(), strict=True))
+        for number, rebuilt in turns.items():
+            expected = self._history.bots[number].turns
+            if rebuilt != expected:
+                raise NoBot(f"bot {number} cannot be resumed: its context took {rebuilt} turns of {expected}")

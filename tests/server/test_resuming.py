@@ -1,0 +1,192 @@
+"""THREATS 20: the server dies at any request, and what the engine sees is the run without interruption, to the bit."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bot_runtime.bundle import Bundle
+from protocol.errors import NoBot, NoConnection, NoPendingQuery, OutOfRange
+from protocol.replies import Welcome
+from protocol.resuming import ResumingClient
+from tests.bundles import make_bundle
+from tests.protocol.golden import TABLE, WELCOME
+from tests.server.mortal import Mortal, episode, plain, resuming
+from tests.server.serving import Served, costly_numbers, free_numbers, play, same
+
+FRAMES = range(20)
+KINDS = {"context": {}, "memoryless": {"context_length": 1, "method": "rcbc"}, "conditioned": {"target_cost": 0.25}}
+GAP = 17  # requests from one death to the next
+
+
+@pytest.fixture(scope="module", params=sorted(KINDS))
+def loaded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    """Span 4 and 2 layers: a turn is felt for 6 more, and an episode has 27."""
+    folder = tmp_path_factory.mktemp(request.param)
+    return Bundle.load(make_bundle(folder, features=TABLE, action=WELCOME.action, budget=0.6, **KINDS[request.param]))
+
+
+@pytest.fixture(scope="module")
+def tiny(bundle: Path) -> Bundle:
+    return Bundle.load(bundle)
+
+
+def deaths(first: int, requests: int, moments: tuple[str, str]) -> dict[int, str]:
+    return {cut: moments[n % 2] for n, cut in enumerate(range(first, requests, GAP))}
+
+
+def test_wherever_it_dies_the_episode_is_the_same(loaded: Bundle) -> None:
+    unbroken = Mortal(loaded, {})
+    expected = episode(plain(unbroken), TABLE, FRAMES)
+    for first in range(0, GAP, 5):
+        for moments in (("before", "after"), ("after", "before")):
+            mortal = Mortal(loaded, deaths(first, unbroken.requests, moments))
+            client, n_deaths = resuming(mortal), len(mortal.deaths)
+            assert episode(client, TABLE, FRAMES) == expected, (first, moments)
+            assert (mortal.lives, client.resumed) == (n_deaths + 1, n_deaths)
+            assert not mortal.deaths
+
+
+def test_turns_that_no_context_took_are_not_replayed(tiny: Bundle) -> None:
+    """Whole messages that fell back, first and last ones too; then one bot's turns alone."""
+    for broken in ({0: [0, 1, 2], 14: [0, 1, 2], 15: [0, 1, 2], 30: [0, 1, 2]}, {4: [1], 16: [0], 29: [2]}):
+        unbroken = Mortal(tiny, {}, broken)
+        expected = episode(plain(unbroken), TABLE, FRAMES)
+        assert expected != episode(plain(Mortal(tiny, {})), TABLE, FRAMES)
+        for first in (1, 9):
+            mortal = Mortal(tiny, deaths(first, unbroken.requests, ("after", "before")), broken)
+            assert episode(resuming(mortal), TABLE, FRAMES) == expected, (first, broken)
+
+
+def test_one_turn_less_would_not_do(tiny: Bundle) -> None:
+    """The number that welcome names is the least: the others see a context that was not rebuilt."""
+    expected = episode(plain(Mortal(tiny, {})), TABLE, FRAMES)
+
+    def differs(cut: int) -> bool:
+        client = resuming(Mortal(tiny, {cut: "before"}))
+        hello = client.hello
+
+        def forgetful_hello(**said: object) -> Welcome:
+            welcome = hello(**said)
+            client._history._depth = welcome.replay_frames - 1
+            return welcome
+
+        client.hello = forgetful_hello
+        return episode(client, TABLE, FRAMES) != expected
+
+    assert any(differs(cut) for cut in range(54, 60))
+
+
+def test_bots_that_stopped_stay_so_and_the_others_go_on(tiny: Bundle) -> None:
+    def run(client: ResumingClient, mortal: Mortal) -> list[object]:
+        client.hello()
+        bots = client.start(4, seeds=[1, 2, 3, 4])
+        played = play(client, TABLE, bots[:2], range(4)) + play(client, TABLE, bots[2:], range(4))
+        assert client.stop(bots[:2]) == 2
+        if mortal.deaths:
+            mortal.deaths[mortal.requests] = "before"
+        return played + play(client, TABLE, bots[2:], range(4, 12))
+
+    unbroken, mortal = Mortal(tiny, {}), Mortal(tiny, {17: "after", 10**9: "before"})
+    assert same(run(resuming(mortal), mortal), run(resuming(unbroken), unbroken))
+    assert mortal.lives > 1
+
+
+def test_requests_that_were_answered_before_a_death_are_answered_so_after_it(tiny: Bundle) -> None:
+    mortal = Mortal(tiny, {})
+    client = resuming(mortal)
+    client.hello()
+    bots, others = client.start(2, seeds=[1, 2]), client.start(1, seeds=[3])
+    play(client, TABLE, bots, range(3))
+    free, costly = free_numbers(TABLE, 2, 3), costly_numbers(TABLE, 2, 3)
+    queries = client.query(bots, 3, free, [0.25, 0.25])
+    mortal.deaths[mortal.requests] = "before"
+    client.query(others, 0, free[:1])
+    assert client.query(bots, 3, free, [0.25, 0.25]) is queries
+    actions = client.act(bots, 3, queries.queries, costly)
+    mortal.deaths[mortal.requests] = "before"
+    client.query(others, 1, free[:1])
+    assert client.act(bots, 3, queries.queries, costly) is actions
+    rest = play(client, TABLE, bots, range(4, 8))
+
+    unbroken = resuming(Mortal(tiny, {}))
+    unbroken.hello()
+    assert same([actions, *rest], play(unbroken, TABLE, unbroken.start(2, seeds=[1, 2]), range(8))[3:])
+
+
+def test_refusals_come_through_and_change_nothing(tiny: Bundle) -> None:
+    client = resuming(Mortal(tiny, {30: "before"}))
+    with pytest.raises(NoConnection):
+        client.start(1)
+    client.hello()
+    bots, none = client.start(2, seeds=[1, 2]), np.zeros((2, TABLE.n_queries), dtype=bool)
+    played = []
+    for frame in range(12):
+        free, costly = free_numbers(TABLE, 2, frame), costly_numbers(TABLE, 2, frame)
+        far = free + np.float32(1000.0)
+        for refusal, refused in (
+            (NoBot, partial(client.query, [7], frame, free[:1])),
+            (NoPendingQuery, partial(client.act, bots, frame, none, costly)),
+            (OutOfRange, partial(client.query, bots, frame, far, [5.0, 5.0])),
+            (OutOfRange, partial(client.take, bots, frame, far, none, costly, [5.0, 5.0])),
+        ):
+            with pytest.raises(refusal):
+                refused()
+        played += play(client, TABLE, bots, range(frame, frame + 1))
+    unbroken = resuming(Mortal(tiny, {}))
+    unbroken.hello()
+    assert same(played, play(unbroken, TABLE, unbroken.start(2, seeds=[1, 2]), range(12)))
+
+
+def test_it_gives_up_after_its_limit_and_can_be_asked_again(tiny: Bundle) -> None:
+    mortal, now, pauses = Mortal(tiny, {2: "before"}), [0.0], []
+    client = ResumingClient("tcp://127.0.0.1:1", limit_s=3.0, clock=lambda: now[0], sleep=pauses.append)
+    client._client._transport = mortal
+    client.hello()
+    bots = client.start(1, seeds=[1])
+    play(client, TABLE, bots, range(1))
+    mortal.absence = 10**9
+
+    def pause(pause_s: float) -> None:
+        pauses.append(pause_s)
+        now[0] += pause_s
+
+    client._sleep = pause
+    with pytest.raises(ConnectionError):
+        client.query(bots, 1, free_numbers(TABLE, 1, 1), [0.25])
+    assert 3.0 <= sum(pauses) < 3.5
+    assert sorted(pauses) == pauses
+    mortal.absence = mortal.absent = 0
+    unbroken = resuming(Mortal(tiny, {}))
+    unbroken.hello()
+    assert same(
+        play(client, TABLE, bots, range(1, 6)), play(unbroken, TABLE, unbroken.start(1, seeds=[1]), range(6))[1:]
+    )
+
+
+def test_another_bundle_cannot_go_on(tiny: Bundle, tmp_path: Path) -> None:
+    mortal = Mortal(tiny, {2: "before"})
+    client = resuming(mortal)
+    client.hello()
+    bots = client.start(1)
+    play(client, TABLE, bots, range(1))
+    mortal.bundle = Bundle.load(make_bundle(tmp_path, features=TABLE, action=WELCOME.action, budget=0.6, seed=1))
+    with pytest.raises(NoBot, match="another bundle"):
+        client.query(bots, 1, free_numbers(TABLE, 1, 1))
+
+
+@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+def test_a_line_that_is_cut_is_no_death(served: Served, door: str) -> None:
+    """Over HTTP the connection lives on and nothing is replayed; a stream's bots ended with it and are rebuilt."""
+    with ResumingClient(served.addresses[door]) as client, ResumingClient(served.addresses[door]) as unbroken:
+        client.hello()
+        unbroken.hello()
+        bots, played = client.start(2, seeds=[1, 2]), []
+        for frame in range(12):
+            client._client._transport.close()
+            played += play(client, TABLE, bots, range(frame, frame + 1))
+        assert same(played, play(unbroken, TABLE, unbroken.start(2, seeds=[1, 2]), range(12)))
+        assert client.resumed == (0 if door == "http" else 12)
