@@ -22,7 +22,7 @@ from game.env import ACTION_SPEC, MAX_DECISIONS, NavigationEnv
 from game.launcher import ServerFailed, ServerProcess
 from game.live import LiveView
 from game.picture import draw_picture
-from game.squad import Bot, Leg, play_leg
+from game.squad import Bot, Leg, Measure, play_leg
 from game.summary import Summary, full_features_return, print_summary, summarise
 from game.terrain import MapError
 from protocol.client import BotClient, Welcome
@@ -47,12 +47,16 @@ class Play:
     connect: str | None = None  # http://host:port of a running server, instead of one of our own
     connect_socket: str | None = None  # that server's tcp://host:port or unix:///path; without it all goes over HTTP
     token: str | None = None  # what that server asks for
+    measure: Measure | None = None  # keep budgets by what casting takes here by this clock, not by declared costs
+    budget_us: float | None = None  # most that a bot may spend in a frame, instead of the bundle's own
     picture: Path = Path("out/demo.png")
     json: bool = False  # end stdout with one line of JSON, and show everything else on stderr
 
     def __post_init__(self) -> None:
         if min(self.bots, self.episodes, self.max_decisions) < 1:
             raise ValueError("bots, episodes and max_decisions must be at least 1")
+        if self.budget_us is not None and not 0.0 <= self.budget_us < float("inf"):
+            raise ValueError(f"budget_us is {self.budget_us}, expected 0 or more")
         if not 0 <= self.socket_episodes < self.episodes:
             raise ValueError(f"socket_episodes is {self.socket_episodes}, expected 0 to one less than episodes")
         if self.connect is None and self.connect_socket is not None:
@@ -123,7 +127,9 @@ def play(config: Play, console: Console) -> Summary:
         draw_picture(config.picture, squad[0].env.terrain, episodes, costs, welcome.budget_us, title)
     socket = legs[1] if len(legs) > 1 else None
     full_features = full_features_return(config.bundle)
-    return summarise(legs[0], socket, welcome, config.map, full_features, config.picture)
+    return summarise(
+        legs[0], socket, welcome, config.map, full_features, config.picture, measured=config.measure is not None
+    )
 
 
 def _own_server(bundle: Path) -> ServerProcess:
@@ -147,11 +153,14 @@ def _play_legs(
         for url, leg_seeds in plan:
             with BotClient(url) as client:
                 welcome = client.hello(token=config.token)
+                if config.budget_us is not None:
+                    welcome = welcome._replace(budget_us=config.budget_us)
                 if view is None:
                     _check_same_game(welcome, squad[0].env)
                     view = stack.enter_context(LiveView(console, squad, welcome, config.episodes))
                 view.door = url.partition(":")[0]
-                legs.append(play_leg(client, squad, leg_seeds, view.update))
+                measure, budget_us = config.measure, config.budget_us
+                legs.append(play_leg(client, squad, leg_seeds, view.update, measure=measure, budget_us=budget_us))
     return welcome, legs
 
 

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,10 @@ from game.env import NavigationEnv
 from game.layout import Layout
 from protocol.client import BotClient
 
-__all__ = ["Bot", "Episode", "Leg", "play_leg"]
+__all__ = ["Bot", "Episode", "Leg", "Measure", "play_leg"]
+
+Measure = Literal["cpu", "wall"]
+"""By what casting is measured: this thread's own time, or the time that the frame waits, others' turns included."""
 
 _FULL_CAST_EVERY = 10
 """Every tenth turn of a bot times a cast of all rays. That turn's own cast comes second, on warm caches, so its time
@@ -39,6 +43,7 @@ class Episode:
     cast_us: NDArray[np.float64]  # [T], casting what was asked for
     full_cast_us: NDArray[np.float64]  # [T], casting everything
     fallbacks: int  # turns whose action was not the learned one
+    charged_us: NDArray[np.float64]  # [T], what the server says that the query costs
 
     @property
     def turns(self) -> int:
@@ -74,6 +79,7 @@ class Bot:
     _total: float = 0.0
     _path_m: list[tuple[float, float]] = field(default_factory=list)
     _cast_us: list[tuple[float, float]] = field(default_factory=list)
+    _charged_us: list[float] = field(default_factory=list)
     _fallbacks: int = 0
 
     def begin(self, seed: int, handle: int) -> None:
@@ -81,22 +87,23 @@ class Bot:
         self.seed, self.handle = seed, handle
         self.distance_m = self.env.restart(seed=seed)["distance_m"]
         self.reward = self._total = 0.0
-        self.queries, self._cast_us, self._fallbacks = [], [], 0
+        self.queries, self._cast_us, self._charged_us, self._fallbacks = [], [], [], 0
         self._path_m = [self._here()]
 
-    def cast(self, query_M: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Values [D] of what was asked for."""
+    def cast(self, query_M: NDArray[np.bool_], charged_us: float) -> tuple[NDArray[np.float32], dict[Measure, float]]:
+        """Values [D] of what was asked for, and how many µs that took by either clock."""
         full_us = np.nan
         if len(self.queries) % _FULL_CAST_EVERY == _FULL_CAST_EVERY - 1:
             begun = time.perf_counter()
             self.env.cast(np.ones_like(query_M))
             full_us = 1e6 * (time.perf_counter() - begun)
-        begun = time.perf_counter()
+        begun, begun_cpu = time.perf_counter(), time.thread_time()
         costly_D = self.env.cast(query_M)
-        cast_us = 1e6 * (time.perf_counter() - begun)
+        cast_us, cpu_us = 1e6 * (time.perf_counter() - begun), 1e6 * (time.thread_time() - begun_cpu)
         self.queries.append(query_M)
         self._cast_us.append((cast_us if np.isnan(full_us) else np.nan, full_us))
-        return costly_D
+        self._charged_us.append(charged_us)
+        return costly_D, {"wall": cast_us, "cpu": cpu_us}
 
     def advance(self, action_A: NDArray[np.float32], reason: int) -> Episode | None:
         """Play one decision; the episode, if that ended it."""
@@ -110,7 +117,7 @@ class Bot:
         cast_us_T2 = np.array(self._cast_us)
         self.last = Episode(
             self.seed, self.env.layout, self._total, info["reached"], info["died"], np.array(self._path_m),
-            np.stack(self.queries), cast_us_T2[:, 0], cast_us_T2[:, 1], self._fallbacks,
+            np.stack(self.queries), cast_us_T2[:, 0], cast_us_T2[:, 1], self._fallbacks, np.array(self._charged_us),
         )  # fmt: skip
         self.seed = None
         return self.last
@@ -120,10 +127,18 @@ class Bot:
 
 
 def play_leg(
-    client: BotClient, squad: Sequence[Bot], seeds: Sequence[int], on_frame: Callable[[list[Episode]], None]
+    client: BotClient,
+    squad: Sequence[Bot],
+    seeds: Sequence[int],
+    on_frame: Callable[[list[Episode]], None],
+    *,
+    measure: Measure | None = None,
+    budget_us: float | None = None,
 ) -> Leg:
     """Play an episode a seed, as many at once as the squad has bots. The client has said hello.
 
+    With `measure` the server is told what casting took by that clock, and keeps budgets by it; `budget_us` is each
+    bot's, instead of the bundle's.
     `on_frame` is told after every frame which episodes have just ended. The server's bot takes the episode's seed, so
     the same seeds give the same episodes. Raises ProtocolError and OSError as the client does.
     """
@@ -131,15 +146,18 @@ def play_leg(
     episodes: list[Episode] = []
     turn_us: list[float] = []
     infer_us = 0.0
-    while live := _seated(client, squad, waiting):
+    while live := _seated(client, squad, waiting, budget_us):
         handles = [bot.handle for bot in live]
         free_NF = np.stack([bot.env.observe_free() for bot in live])
         asked_at = time.perf_counter()
         queries = client.query(handles, frame, free_NF, [bot.reward for bot in live])
         told_at = time.perf_counter()
-        costly_ND = np.stack([bot.cast(query_M) for bot, query_M in zip(live, queries.queries, strict=True)])
+        asked = zip(live, queries.queries, queries.cost_us.tolist(), strict=True)
+        costly, taken = zip(*(bot.cast(query_M, charged_us) for bot, query_M, charged_us in asked), strict=True)
+        costly_ND = np.stack(costly)
+        acquire_us = None if measure is None else sum(took_us[measure] for took_us in taken)
         sent_at = time.perf_counter()
-        actions = client.act(handles, frame, queries.queries, costly_ND)
+        actions = client.act(handles, frame, queries.queries, costly_ND, acquire_us=acquire_us)
         turn_us.append(1e6 * (time.perf_counter() - sent_at + told_at - asked_at))
         infer_us += queries.infer_us + actions.infer_us
         outcomes = [
@@ -155,11 +173,13 @@ def play_leg(
     return Leg(episodes, np.array(turn_us), infer_us)
 
 
-def _seated(client: BotClient, squad: Sequence[Bot], waiting: deque[int]) -> list[Bot]:
+def _seated(client: BotClient, squad: Sequence[Bot], waiting: deque[int], budget_us: float | None) -> list[Bot]:
     """Give each idle bot the next episode, and return the bots that play."""
     idle = [bot for bot in squad if bot.seed is None][: len(waiting)]
     if idle:
         seeds = [waiting.popleft() for _ in idle]
-        for bot, seed, handle in zip(idle, seeds, client.start(len(idle), seeds=seeds).tolist(), strict=True):
+        budgets_us = None if budget_us is None else [budget_us] * len(idle)
+        handles = client.start(len(idle), seeds=seeds, budgets_us=budgets_us).tolist()
+        for bot, seed, handle in zip(idle, seeds, handles, strict=True):
             bot.begin(seed, handle)
     return [bot for bot in squad if bot.seed is not None]

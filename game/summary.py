@@ -52,9 +52,11 @@ class Summary:
     timed_out: int
     turns: int
     cost_pct: float  # declared cost of what was asked for, of that of everything
+    measured: bool  # whether budgets were kept by what casting was measured to take, instead of by declared costs
     budget_us: float
-    largest_cost_us: float  # declared cost of the dearest query of all
+    largest_cost_us: float  # of the dearest query of all, by the costs that counted
     budget_violations: int
+    charged_us_per_frame: float  # what queries cost by the costs that counted, in the mean
     fallbacks: int
     rays_us_cast_per_frame: float  # measured
     rays_us_full_per_frame: float  # measured, on every tenth turn
@@ -80,13 +82,22 @@ def full_features_return(bundle: Path | None) -> float | None:
 
 
 def summarise(
-    http: Leg, socket: Leg | None, welcome: Welcome, map_name: str, full_features: float | None, picture: Path | None
+    http: Leg,
+    socket: Leg | None,
+    welcome: Welcome,
+    map_name: str,
+    full_features: float | None,
+    picture: Path | None,
+    *,
+    measured: bool = False,
 ) -> Summary:
-    """Add up one or two legs. Violations are counted here, from what was asked for and the declared costs alone."""
+    """Add up one or two legs. Violations are counted here, from what was asked for and the declared costs alone; where
+    costs were `measured`, from what the server said that each query would cost."""
     legs = [http] if socket is None else [http, socket]
     episodes = [episode for leg in legs for episode in leg.episodes]
     declared = CostModel.declared(welcome.features)
     cost_us_T = np.concatenate([declared.query_cost_us(episode.queries) for episode in episodes])
+    charged_us_T = np.concatenate([episode.charged_us for episode in episodes]) if measured else cost_us_T
     cast_us = _mean([episode.cast_us for episode in episodes])
     full_us = _mean([episode.full_cast_us for episode in episodes])
     cost_us = float(cost_us_T.mean())
@@ -101,9 +112,11 @@ def summarise(
         timed_out=sum(not (episode.reached or episode.died) for episode in episodes),
         turns=len(cost_us_T),
         cost_pct=round(100.0 * cost_us / declared.full_us, 3),
+        measured=measured,
         budget_us=welcome.budget_us,
-        largest_cost_us=round(float(cost_us_T.max()), 3),
-        budget_violations=int((cost_us_T > welcome.budget_us).sum()),
+        largest_cost_us=round(float(charged_us_T.max()), 3),
+        budget_violations=int((charged_us_T > welcome.budget_us).sum()),
+        charged_us_per_frame=round(float(charged_us_T.mean()), 2),
         fallbacks=sum(episode.fallbacks for episode in episodes),
         rays_us_cast_per_frame=round(cast_us, 2),
         rays_us_full_per_frame=round(full_us, 2),
@@ -129,8 +142,14 @@ def print_summary(summary: Summary, console: Console) -> None:
     table.add_row(
         "budget violations",
         f"{summary.budget_violations} of {summary.turns} turns; the dearest query cost "
-        f"{summary.largest_cost_us:.2f} of {summary.budget_us:.2f} µs",
+        f"{summary.largest_cost_us:.2f} of {summary.budget_us:.2f} µs, "
+        f"{'as measured with a margin' if summary.measured else 'by declared costs'}",
     )
+    if summary.rays_us_full_per_frame > 0.0 and summary.declared_us_cast_per_frame > 0.0:
+        cast = summary.rays_us_cast_per_frame / summary.declared_us_cast_per_frame
+        full = summary.rays_us_full_per_frame / summary.declared_us_full_per_frame
+        charged = f"; charged {summary.charged_us_per_frame:.1f} µs a turn" if summary.measured else ""
+        table.add_row("measured / declared", f"{cast:.2f} for what was cast, {full:.2f} for all rays{charged}")
     if summary.fallbacks:
         table.add_row("fallbacks", f"{summary.fallbacks} turns whose action was not the learned one")
     for door, latency in (("HTTP", summary.turn_us.http), ("socket", summary.turn_us.socket)):

@@ -27,7 +27,7 @@ def played(env: NavigationEnv, console: Console) -> tuple[str, Episode]:
         for bot, decisions in zip(squad, (1, 2), strict=True):
             bot.begin(5, 0)
             env.max_decisions = decisions
-            bot.cast(query_M)
+            bot.cast(query_M, 25.8)
             ended = bot.advance(STAND_STILL, 0)
             view.update([] if ended is None else [ended])
         assert view.done == 1

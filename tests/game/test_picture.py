@@ -21,7 +21,7 @@ def episode(terrain: Terrain, turns: int, *, reached: bool = False, died: bool =
     nan_T = np.full(turns, np.nan)
     path_m = rng.uniform(-20, 20, (turns + 1, 2))
     queries_TM = rng.random((turns, TABLE.n_queries)) < asked
-    return Episode(turns, draw_layout(terrain, rng), 1.0, reached, died, path_m, queries_TM, nan_T, nan_T, 0)
+    return Episode(turns, draw_layout(terrain, rng), 1.0, reached, died, path_m, queries_TM, nan_T, nan_T, 0, nan_T)
 
 
 def test_the_shown_episode_is_the_median_of_those_that_arrived():

@@ -25,7 +25,8 @@ class Ledger:
         self.stopped: list[int] = []
         self.turns: list[dict[str, object]] = []
 
-    def start(self, count: int, *, seeds: list[int]) -> np.ndarray:
+    def start(self, count: int, *, seeds: list[int], budgets_us: list[float] | None) -> np.ndarray:
+        self.budgets_us = budgets_us
         handles = [100 + seed for seed in seeds]
         self.started.update(zip(handles, seeds, strict=True))
         assert len(handles) == count
@@ -34,12 +35,15 @@ class Ledger:
     def query(self, bots: list[int], frame: int, free: np.ndarray, rewards: list[float]) -> Queries:
         queries_NM = self.rng.random((len(bots), len(RAYS))) < 0.1
         self.turns.append({"frame": frame, "bots": bots, "free": free, "rewards": rewards, "queries": queries_NM})
-        return Queries(frame, queries_NM, np.zeros(len(bots)), 1.0, np.zeros(len(bots), dtype=np.uint8))
+        charged_N, reasons_N = queries_NM.sum(axis=1) * 2.0, np.zeros(len(bots), dtype=np.uint8)
+        return Queries(frame, queries_NM, charged_N, 1.0, reasons_N)
 
-    def act(self, bots: list[int], frame: int, acquired: np.ndarray, costly: np.ndarray) -> Actions:
+    def act(
+        self, bots: list[int], frame: int, acquired: np.ndarray, costly: np.ndarray, acquire_us: float | None
+    ) -> Actions:
         assert bots == self.turns[-1]["bots"]
         assert frame == self.turns[-1]["frame"]
-        self.turns[-1] |= {"acquired": acquired, "costly": costly}
+        self.turns[-1] |= {"acquired": acquired, "costly": costly, "acquire_us": acquire_us}
         actions_NA = self.rng.uniform([-1, 0, 0], [1, 1, 1], (len(bots), 3)).astype(np.float32)
         self.turns[-1]["actions"] = actions_NA
         return Actions(frame, actions_NA, np.zeros(len(bots), dtype=np.uint8), 2.0)
@@ -129,3 +133,24 @@ def test_an_episode_is_its_seeds_alone(squad, played):
         assert episode.layout == squad[0].env.layout
         assert len(episode.path_m) == episode.turns + 1
     squad[0].seed = None
+
+
+def test_what_the_server_charged_is_kept(played):
+    _, leg, _ = played
+    for episode in leg.episodes:
+        assert np.array_equal(episode.charged_us, 2.0 * episode.queries.sum(axis=1))
+
+
+def test_what_casting_took_is_told_only_when_it_is_to_count(played, squad):
+    ledger, _, _ = played
+    assert {turn["acquire_us"] for turn in ledger.turns} == {None}
+    measured = Ledger()
+    leg = play_leg(measured, squad, SEEDS[:2], lambda ended: None, measure="wall")
+    told_us = [turn["acquire_us"] for turn in measured.turns]
+    assert min(told_us) > 0.0
+    by_cpu = Ledger()
+    play_leg(by_cpu, squad, SEEDS[:1], lambda ended: None, measure="cpu", budget_us=12.5)
+    assert min(turn["acquire_us"] for turn in by_cpu.turns) > 0.0
+    assert (ledger.budgets_us, by_cpu.budgets_us) == (None, [12.5])
+    # A turn that timed everything does not keep its own cast's time, so what was kept is the lesser sum.
+    assert sum(told_us) > np.nansum(np.concatenate([episode.cast_us for episode in leg.episodes]))

@@ -30,7 +30,8 @@ def episode(asked: list[int], *, total: float = 50.0, reached: bool = False, die
     cast_us_T = np.where(np.arange(len(asked)) == 0, np.nan, 10.0)
     full_us_T = np.where(np.arange(len(asked)) == 0, 100.0, np.nan)
     path_m = np.zeros((len(asked) + 1, 2))
-    return Episode(7, LAYOUT, total, reached, died, path_m, queries_TM, cast_us_T, full_us_T, 0)
+    charged_us_T = np.array(asked) * 3.0
+    return Episode(7, LAYOUT, total, reached, died, path_m, queries_TM, cast_us_T, full_us_T, 0, charged_us_T)
 
 
 def leg(*episodes: Episode, turn_us: tuple[float, ...] = (100.0, 300.0)) -> Leg:
@@ -58,6 +59,16 @@ def test_a_query_dearer_than_the_budget_is_counted(asked, violations):
     assert summary.budget_violations == violations
 
 
+def test_measured_costs_are_judged_by_what_was_charged():
+    """4 rays are within the budget by declared costs and not at 3 µs a ray; the share of all is as declared."""
+    played, budget_us = leg(episode([1, 4])), 11.9
+    declared = summarise(played, None, welcome(budget_us), "hard", None, None)
+    measured = summarise(played, None, welcome(budget_us), "hard", None, None, measured=True)
+    assert (declared.budget_violations, measured.budget_violations) == (0, 1)
+    assert (measured.largest_cost_us, measured.charged_us_per_frame) == (12.0, 7.5)
+    assert measured.cost_pct == declared.cost_pct
+
+
 def test_the_json_line_is_one_line_of_plain_json():
     summary = summarise(leg(episode([1])), None, welcome(1.0), "hard", None, None)
     line = summary.json_line()
@@ -73,6 +84,10 @@ def test_people_read_the_same_figures(capsys):
     shown = capsys.readouterr().out
     assert "45.0, 75 % of the 60.0 with all rays" in shown
     assert "1 of 2 turns" in shown
+    assert "by declared costs" in shown
+    assert f"{10.0 / (COSTS_M[:5].sum() / 2):.2f} for what was cast, {100.0 / COSTS_M.sum():.2f} for all rays" in shown
+    print_summary(summarise(http, None, welcome(1.0), "hard", 60.0, None, measured=True), Console(width=120))
+    assert "charged 7.5 µs a turn" in capsys.readouterr().out
 
 
 def test_the_model_with_all_rays_is_read_from_the_bundles_folder(tmp_path):
