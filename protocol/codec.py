@@ -35,6 +35,7 @@ class Format(Enum):
 
     MSGPACK = "application/msgpack"
     JSON = "application/json"
+    __hash__ = object.__hash__  # of Enum's own, every look-up by format pays for a call
 
 
 class _Peeked(msgspec.Struct):

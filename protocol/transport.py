@@ -133,10 +133,7 @@ class StreamTransport:
             if self._socket is None:
                 self._socket = self._connect()
             self._socket.sendall(struct.pack(">I", len(body)) + body)
-            (size,) = struct.unpack(">I", _read_exactly(self._socket, 4))
-            if size > MAX_REPLY_BYTES:
-                raise ReplyError(f"the server announces a reply of {size} bytes, more than {MAX_REPLY_BYTES}")
-            return _read_exactly(self._socket, size)
+            return _read_frame(self._socket)
         except OSError:
             self.close()
             raise
@@ -190,6 +187,20 @@ def _read_http(source: socket.socket) -> tuple[bytes, bool]:
         body += _read_exactly(source, missing)
     is_kept = status.startswith("HTTP/1.1") and "close" not in headers.get("connection", "").lower()
     return body, is_kept
+
+
+def _read_frame(source: socket.socket) -> bytes:
+    """One frame's body, nearly always read in one go. Raises ReplyError for one that is too large, or not alone."""
+    data = source.recv(_READ_BYTES)
+    if len(data) < 4:
+        data += _read_exactly(source, 4 - len(data))
+    (size,) = struct.unpack_from(">I", data)
+    if size > MAX_REPLY_BYTES:
+        raise ReplyError(f"the server announces a reply of {size} bytes, more than {MAX_REPLY_BYTES}")
+    missing = size - (len(data) - 4)
+    if missing < 0:
+        raise ReplyError(f"{-missing} bytes follow the reply")
+    return data[4:] + _read_exactly(source, missing) if missing else data[4:]
 
 
 def _read_exactly(source: socket.socket, size: int) -> bytes:

@@ -10,6 +10,7 @@ import asyncio
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from protocol import codec
 from protocol.codec import Format
@@ -23,6 +24,7 @@ from server.worker import Worker
 __all__ = ["Desk", "Pace"]
 
 _MAX_INLINE_BYTES = 16384  # decoding so much takes less than a turn
+_TURNS = RequestQueries, SubmitFeatures, TakeTurn
 _Kind = tuple[type[Request], int]  # and the number of bits in its number of bots: sizes within a factor of two
 
 Answered = Answer | asyncio.Future[Answer]
@@ -53,9 +55,10 @@ class Pace:
 class Desk:
     """Answers requests of every door in the order in which they come, one at a time.
 
-    A turn is answered before `ask` returns if the worker is idle and turns like it take at most `inline_us` of
-    processor time. That is how long one client's request may hold up the event loop: one that is larger, or of a size
-    that was not met before, never does. `clock` counts ns of the calling thread's processor time.
+    A turn is answered before `ask` returns if the worker is idle and turns like it take at most `inline_us`. That is
+    how long one client's request may hold up the event loop: one that is larger, or of a size that was not met before,
+    never does. `clock` counts ns; so does `worker_clock`, but only while its thread runs: the worker also waits for
+    the interpreter, which the event loop would not.
     """
 
     def __init__(
@@ -65,13 +68,15 @@ class Desk:
         *,
         inline_us: float,
         due: Due | None = None,
-        clock: Callable[[], int] = time.thread_time_ns,
+        clock: Callable[[], int] = time.monotonic_ns,
+        worker_clock: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         self.handlers = handlers
         self.due = due or Due(worker)
         self._worker = worker
         self._inline_us = inline_us
         self._clock = clock
+        self._worker_clock = worker_clock
         self._pace = Pace()
 
     def ask(
@@ -85,31 +90,38 @@ class Desk:
         reply_form: Format | None = None,
     ) -> Answered:
         """The answer, or the future of it. Arguments are those of `server.answer.answer`."""
-        how = partial(answer, self.handlers, kind=kind, reply_form=reply_form)
         reply_form = reply_form or form
         if len(body) > _MAX_INLINE_BYTES:
-            deadline = self.due.of(codec.peek_deadline_us(body, form), arrival.received_ns)
-            arrival = arrival._replace(deadline=deadline)
-            job = partial(how, body, form, connection_id, arrival)
+            arrival = self._due_by(arrival, codec.peek_deadline_us(body, form))
+            job = partial(answer, self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form)
             return self._in_time(job, arrival, (bytes, len(body)), reply_form)
         try:
             request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)
-        except ProtocolError:
-            return how(body, form, connection_id, arrival)  # which refuses it, bots untouched
-        how = partial(how, request, form, connection_id, decoded_ns=time.monotonic_ns())
-        if not isinstance(request, RequestQueries | SubmitFeatures | TakeTurn):
-            return self._hop(partial(how, arrival), arrival, reply_form)
-        deadline = self.due.of(request.deadline_us, arrival.received_ns)
-        arrival = arrival._replace(deadline=deadline)
+        except ProtocolError:  # answered by refusing it, bots untouched
+            return answer(self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form)
+        how: dict[str, Any] = {"reply_form": reply_form, "decoded_ns": time.monotonic_ns()}
+        if not isinstance(request, _TURNS):
+            return self._hop(
+                partial(answer, self.handlers, request, form, connection_id, arrival, **how), arrival, reply_form
+            )
+        arrival = self._due_by(arrival, request.deadline_us)
         turn = type(request), len(request.bots).bit_length()
-        job = partial(self._timed, turn, partial(how, arrival))
         if self._worker.is_idle and self._pace.expected_us(turn) <= self._inline_us:
-            return job() if deadline is None else self.due.kept(deadline, job(), reply_form)
-        return self._in_time(job, arrival, (type(request), len(request.bots)), reply_form)
+            begun_ns = self._clock()
+            answered = answer(self.handlers, request, form, connection_id, arrival, **how)
+            self._pace.observe(turn, (self._clock() - begun_ns) / 1e3)
+            return answered if arrival.deadline is None else self.due.kept(arrival.deadline, answered, reply_form)
+        job = partial(answer, self.handlers, request, form, connection_id, arrival, **how)
+        work = type(request), len(request.bots)
+        return self._in_time(partial(self._timed, turn, job), arrival, work, reply_form)
 
     def end(self, connection_id: str) -> None:
         """End a connection whose socket has closed, after what was asked for on it."""
         self._worker.post(partial(self.handlers.end, connection_id))
+
+    def _due_by(self, arrival: Arrival, deadline_us: float | None) -> Arrival:
+        deadline = self.due.of(deadline_us, arrival.received_ns)
+        return arrival if deadline is None else arrival._replace(deadline=deadline)
 
     def _in_time(
         self, job: Callable[[], Answer], arrival: Arrival, work: tuple[type[object], int], form: Format
@@ -140,7 +152,7 @@ class Desk:
             return refusal(error, form)
 
     def _timed(self, turn: _Kind, job: Callable[[], Answer]) -> Answer:
-        begun_ns = self._clock()
+        begun_ns = self._worker_clock()
         answered = job()
-        self._pace.observe(turn, (self._clock() - begun_ns) / 1e3)
+        self._pace.observe(turn, (self._worker_clock() - begun_ns) / 1e3)
         return answered

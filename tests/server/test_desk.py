@@ -39,8 +39,11 @@ class Counter:
         self.threads: list[int] = []
         monkeypatch.setattr(module, "answer", self._answer)
         handlers = Handlers(servings, Connections(4, 60.0), None)
-        self.desk = Desk(handlers, self.worker, inline_us=BOUND_US, clock=lambda: self._now_ns)
+        self.desk = Desk(handlers, self.worker, inline_us=BOUND_US, clock=self._clock, worker_clock=self._clock)
         self.connection: str | None = None
+
+    def _clock(self) -> int:
+        return self._now_ns
 
     async def ask(self, message: dict[str, object]) -> tuple[dict[str, object], bool]:
         """The reply, and whether it was given on the event loop."""
