@@ -158,8 +158,6 @@ def _session(file: str, graph: bytes, threads: int) -> ort.InferenceSession:
     options.add_session_config_entry("session.load_model_format", "ONNX")  # never what the bytes seem to be
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    # Products of int8 are exact on every processor: one without VNNI would add pairs of them in 16 bits.
-    options.add_session_config_entry("session.x64quantprecision", "1")
     try:
         return ort.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a dozen unrelated types for a graph that it cannot load
