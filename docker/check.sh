@@ -17,6 +17,7 @@ fail() {
 }
 in_image() { docker run --rm --entrypoint python "$image" -c "$1"; }
 
+"${compose[@]}" --profile observability config -q || fail "compose.yaml is wrong"
 "${compose[@]}" build
 "${compose[@]}" up -d
 server=$("${compose[@]}" ps -q server)

@@ -1,7 +1,8 @@
 """The text that Prometheus scrapes, in its format 0.0.4, in pieces that are short enough to write between two frames.
 
-This module knows nothing about what is counted. prometheus_client's own writer writes everything at once, up to 13 ms in
-which no bot would be answered; pieces here take at most 1.4 (`benchmarks.observing`). Its parser reads them in the tests.
+This module knows nothing about what is counted. prometheus_client's own writer writes everything at once, up to 13 ms
+in which no bot would be answered; pieces here take at most 1.4 (`benchmarks.observing`). Its parser reads them in the
+tests.
 """
 
 from __future__ import annotations
