@@ -47,7 +47,7 @@ class Settings:
     """Connections at any time, and open stream sockets."""
     max_queue: int = 64
     """Requests that wait for the inference thread; those beyond are refused with NOT_READY."""
-    inline_us: float = 1000.0
+    inline_us: float = 500.0
     """A turn that is known to take no longer than this is answered on the event loop itself, which saves the hop to the
     inference thread and is how long one engine may hold up the others. 0 hands every turn to the thread."""
     idle_ttl_s: float = 60.0
