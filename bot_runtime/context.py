@@ -99,9 +99,10 @@ class Contexts:
         """Set what is left of each bot's target return."""
         self._returns_to_go_B[batch.at] = returns_to_go_N
 
-    def follow(self, batch: Batch, hidden_NW: _Floats, turns_N: _Ints) -> None:
-        """Set what a head reads of contexts that are kept elsewhere."""
-        self._rows.before[batch.at, : self._manifest.width] = hidden_NW
+    def follow(self, batch: Batch, hidden_NW: _Floats | None, turns_N: _Ints) -> None:
+        """Set what a head reads of contexts that are kept elsewhere; a hidden state of None is what it was."""
+        if hidden_NW is not None:
+            self._rows.before[batch.at, : self._manifest.width] = hidden_NW
         self._turns_B[batch.at] = turns_N
 
     def advance(self, batch: Batch, action_NA: _Floats, kept_N: NDArray[np.bool_] | None = None) -> None:

@@ -109,10 +109,14 @@ class Head:
         counted_N = inputs.per_bot("rewards", counted, n_bots, -MAX_RETURN, MAX_RETURN)
         self._left_N = self._contexts.returns_to_go(self._company.batch) - counted_N
 
-    def keep(self, hidden_NW: NDArray[np.float32], turns_N: NDArray[np.int64]) -> None:
-        """The frame is over: what the reply says of each bot, and the rewards of `ask` or `skip`. Raises BadShape."""
+    def keep(self, hidden_NW: NDArray[np.float32] | None, turns_N: NDArray[np.int64]) -> None:
+        """The frame is over: what the reply says of each bot, and the rewards of `ask` or `skip`.
+
+        `hidden_NW` is None where a deadline passed: it is then what it was. Raises BadShape.
+        """
         batch = self._company.batch
-        check_shape("hidden", hidden_NW, batch.past_NW.shape, np.float32)
+        if hidden_NW is not None:
+            check_shape("hidden", hidden_NW, batch.past_NW.shape, np.float32)
         check_shape("turns", turns_N, (batch.n_bots,), np.int64)
         self._contexts.follow(batch, hidden_NW, turns_N)
         self._contexts.spend(batch, self._left_N)

@@ -134,6 +134,7 @@ class ResumingClient:
         frame_budget_us: float | None = None,
         budgets_us: ArrayLike | None = None,
         target_costs_us: ArrayLike | None = None,
+        deadline_us: float | None = None,
     ) -> Queries:
         """See BotClient."""
         numbers, earlier = self._numbers(bots), self._before(bots, frame)
@@ -143,7 +144,8 @@ class ResumingClient:
         asked = self._history.ask(numbers, frame, free, rewards, limits)
 
         def ask() -> Queries:
-            return self._client.query(self._now(numbers), frame, free, rewards, **limits)  # type: ignore[arg-type]
+            now = self._now(numbers)
+            return self._client.query(now, frame, free, rewards, deadline_us=deadline_us, **limits)  # type: ignore[arg-type]
 
         queries = self._through(ask, ask)
         self._history.count(asked)
@@ -159,6 +161,7 @@ class ResumingClient:
         failed: ArrayLike | None = None,
         acquire_us: float | None = None,
         hidden: bool = False,
+        deadline_us: float | None = None,
     ) -> Actions:
         """See BotClient. If the server that was asked is gone, the next one is told the whole turn, query and all."""
         numbers, earlier = self._numbers(bots), self._before(bots, frame)
@@ -168,12 +171,13 @@ class ResumingClient:
         turn = self._turns.get(tuple(numbers))
 
         def act() -> Actions:
-            return self._client.act(self._now(numbers), frame, hidden=hidden, **said)  # type: ignore[arg-type]
+            return self._client.act(self._now(numbers), frame, hidden=hidden, deadline_us=deadline_us, **said)  # type: ignore[arg-type]
 
         if turn is None or turn.asked.frame != frame:
             return self._through(act, act)  # which the server refuses
         asked = turn.asked
-        now_said = {**said, **asked.limits, "hidden": hidden, "replayed_returns_to_go": asked.left_N}
+        now_said = {**said, **asked.limits, "hidden": hidden, "deadline_us": deadline_us}
+        now_said["replayed_returns_to_go"] = asked.left_N
 
         def tell() -> Actions:
             return self._client.take(self._now(numbers), frame, asked.free_NF, **now_said)
@@ -194,6 +198,7 @@ class ResumingClient:
         budgets_us: ArrayLike | None = None,
         target_costs_us: ArrayLike | None = None,
         hidden: bool = True,
+        deadline_us: float | None = None,
     ) -> Actions:
         """See BotClient."""
         numbers, earlier = self._numbers(bots), self._before(bots, frame)
@@ -202,7 +207,7 @@ class ResumingClient:
         said = {"acquired": acquired, "costly": costly, "failed": failed, "acquire_us": acquire_us}
         limits = {"frame_budget_us": frame_budget_us, "budgets_us": budgets_us, "target_costs_us": target_costs_us}
         asked = self._history.ask(numbers, frame, free, rewards, limits)
-        now_said = {**said, **limits, "rewards": rewards, "hidden": hidden}
+        now_said = {**said, **limits, "rewards": rewards, "hidden": hidden, "deadline_us": deadline_us}
 
         def take() -> Actions:
             return self._client.take(self._now(numbers), frame, free, **now_said)  # type: ignore[arg-type]
