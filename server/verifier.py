@@ -10,6 +10,7 @@ import asyncio
 import os
 import resource
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -22,11 +23,11 @@ from protocol.errors import BadBundle
 
 __all__ = ["TIMEOUT_S", "verify"]
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 120.0  # also where the machine is busy
 _MAX_MEMORY_BYTES = 8 * 2**30  # of addresses, most of which are never touched
 _MAX_CPU_S = 60
 _MAX_DETAIL_CHARS = 300
-_NICENESS = 10
+_NICENESS = 5  # frames go first
 
 
 class Verdict(msgspec.Struct, forbid_unknown_fields=True):
@@ -65,7 +66,9 @@ async def verify(folder: Path, keys: Sequence[Path] = (), *, timeout_s: float = 
 
 def _verdict(folder: Path, keys: Sequence[Path]) -> Verdict:
     try:
-        return Verdict(sha256=Bundle.load(folder, keys=Keys.read(keys) if keys else None).sha256)
+        # By processor time: how long a turn takes must not depend on what else runs here meanwhile.
+        bundle = Bundle.load(folder, keys=Keys.read(keys) if keys else None, clock=time.process_time_ns)
+        return Verdict(sha256=bundle.sha256)
     except BadBundle as error:
         return Verdict(problem=error.detail[:_MAX_DETAIL_CHARS])
 

@@ -88,10 +88,16 @@ class HttpAnswer(NamedTuple):
 
 
 def http_request(
-    address: str, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
+    address: str,
+    method: str,
+    path: str,
+    body: Any = None,
+    headers: dict[str, str] | None = None,
+    *,
+    timeout_s: float = 10.0,
 ) -> HttpAnswer:
     parts = urlsplit(address)
-    connection = http.client.HTTPConnection(str(parts.hostname), parts.port, timeout=10)
+    connection = http.client.HTTPConnection(str(parts.hostname), parts.port, timeout=timeout_s)
     try:
         connection.request(method, path, body, headers or {})
         with connection.getresponse() as response:

@@ -51,7 +51,8 @@ def served(settings: dict[str, Any], tmp_path: Path) -> Iterator[Served]:
 
 def admin(served: Served, path: str, body: Any = None, token: str | None = ADMIN) -> HttpAnswer:
     headers = {"Content-Type": "application/json"} | ({} if token is None else {"Authorization": f"Bearer {token}"})
-    return http_request(served.addresses["http"], "POST", f"/v1/bundles/{path}", json.dumps(body or {}), headers)
+    address, content = served.addresses["http"], json.dumps(body or {})
+    return http_request(address, "POST", f"/v1/bundles/{path}", content, headers, timeout_s=120.0)  # a process starts
 
 
 def listed(served: Served, token: str = TOKEN) -> dict[str, Any]:
