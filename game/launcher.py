@@ -43,8 +43,11 @@ class ServerProcess:
     sends it SIGTERM when this process dies in any way, kill -9 included; elsewhere kill -9 leaves it running.
     """
 
-    def __init__(self, bundle: Path, *arguments: str, module: str = "server") -> None:
-        """`arguments` go to the server's command line as they are. `module` is what is run, with that command line."""
+    def __init__(self, bundle: Path | None, *arguments: str, module: str = "server") -> None:
+        """`arguments` go to the server's command line as they are, and say what is served where `bundle` is None.
+
+        `module` is what is run, with that command line.
+        """
         self._bundle, self._arguments, self._module = bundle, arguments, module
 
     def __enter__(self) -> Self:
@@ -52,7 +55,7 @@ class ServerProcess:
         self._ready_file = Path(self._folder.name) / "ready.json"
         self._log = Path(self._folder.name) / "server.log"
         command = [
-            *_command(self._module), "--bundle", str(self._bundle), "--port", "0",
+            *_command(self._module), *(() if self._bundle is None else ("--bundle", str(self._bundle))), "--port", "0",
             "--uds", str(self._ready_file.with_name("s")), "--ready-file", str(self._ready_file), *self._arguments,
         ]  # fmt: skip
         with self._log.open("wb") as log:
