@@ -68,12 +68,11 @@ def bundles(servings: Iterable[Serving]) -> Iterator[Metric]:
     by_bundle: dict[tuple[str, str], list[Serving]] = {}
     for serving in servings:
         by_bundle.setdefault((serving.name, _version(serving)), []).append(serving)
-    info = GaugeMetricFamily(
-        "bot_runtime_bundle_info", "1 for each bundle.", labels=[*_BUNDLE, "sha256", "method", "precision"]
-    )
-    for key, (first, *_) in by_bundle.items():
-        info.add_metric([*key, first.sha256, first.manifest.method, _precision(first)], 1)
-    yield info
+    known = {
+        (*key, first.sha256, first.manifest.method, first.manifest.precision): 1.0
+        for key, (first, *_) in by_bundle.items()
+    }
+    yield gauge("bundle_info", "1 for each bundle.", (*_BUNDLE, "sha256", "method", "precision"), known)
 
     def summed(number: str, of: str | None = None) -> dict[tuple[str, ...], float]:
         return {
@@ -147,7 +146,3 @@ def _fill(family: HistogramMetricFamily, labels: list[str], bounds: list[str], c
 def _version(serving: Serving) -> str:
     """Its number in the store, or the beginning of its hash: two bundles of one name are told apart by it."""
     return serving.sha256[:12] if serving.version is None else str(serving.version)
-
-
-def _precision(serving: Serving) -> str:
-    return serving.manifest.provenance.get("precision", "float32")

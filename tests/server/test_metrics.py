@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from bot_runtime.bundle import Bundle
 from protocol.client import BotClient
 from protocol.errors import NoBot
+from server import families
+from server.serving import Serving
 from tests.protocol.golden import TABLE
 from tests.server.serving import RawStream, Served, costly_numbers, free_numbers, http_request, play, serve
 
@@ -73,7 +76,7 @@ def test_what_happened_is_what_it_says(server: Served, door: str) -> None:
         open_sockets = [s.value for s in scrape.samples if s.name == "bot_runtime_sockets"]
         assert open_sockets == ([] if door == "http" else [1])
         assert (scrape("queue_length"), scrape("queue_limit"), scrape("ready")) == (0, 64, 1)
-        assert scrape("bundle_info", bundle="tiny", method="bdt", precision="float32") == 1
+        assert scrape("bundle_info", bundle="tiny", method="bdt", precision="fp32") == 1
     assert {"process_resident_memory_bytes", "process_open_fds", "process_cpu_seconds"} <= set(scrape.families)
 
 
@@ -145,3 +148,16 @@ def test_what_a_door_refuses_is_counted_too(bundle: Path, tmp_path: Path) -> Non
         ("http", "UNAUTHORIZED"): 1,
         ("http", "BAD_JSON"): 1,
     }
+
+
+def test_versions_are_told_apart_and_one_in_memory_twice_is_summed(bundle: Path) -> None:
+    """While versions are exchanged, connections may hold one that was loaded before it was loaded again."""
+    loaded = Bundle.load(bundle)
+    servings = [Serving(loaded, max_bots=4, version=version) for version in (1, 2, 2, None)]
+    for count, serving in enumerate(servings, start=1):
+        serving.bots.start(count)
+    samples = [sample for family in families.bundles(servings) for sample in family.samples]
+    keys = [(sample.name, *sorted(sample.labels.items())) for sample in samples]
+    assert len(keys) == len(set(keys))
+    bots = {sample.labels["version"]: sample.value for sample in samples if sample.name == "bot_runtime_bots"}
+    assert bots == {"1": 1, "2": 2 + 3, servings[0].sha256[:12]: 4}

@@ -66,3 +66,17 @@ def test_a_process_is_named_by_letters_and_digits(process: str) -> None:
     with pytest.raises(ValueError, match="process"):
         Settings(bundle=Path("b"), process=process)
     assert Settings(bundle=Path("b"), process="p1").process == "p1"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"stuck_after_s": 0.0}, "stuck_after_s"),
+        ({"otlp_endpoint": "collector:4318"}, "expected a URL"),
+        ({"otlp_every_s": 0.0}, "otlp_every_s"),
+        ({"otlp_every_s": float("nan")}, "otlp_every_s"),
+    ],
+)
+def test_what_cannot_be_watched_is_refused(wrong: dict[str, float | str], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Settings(bundle=Path("b"), **wrong)
