@@ -1,42 +1,21 @@
-"""A server in memory against the model, in as many runs as wanted: several engines, retries, refusals, gaps, silence.
+"""What engines may do to a server in memory, step by step, its replies compared with the model's.
 
-    python -m tests.fuzz.machine --runs 10000
-
-Requests are bytes, as they come to every door, and so are replies.
+This module knows nothing about how many runs there are. Requests are bytes, as they come to every door, and so are
+replies.
 """
 
 from __future__ import annotations
 
-import json
-import tempfile
-import time
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
-import tyro
-from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from bot_runtime.bots import Bots
-from bot_runtime.bundle import Bundle
-from protocol.codec import Format
-from protocol.errors import ProtocolError
-from server.answer import Arrival, answer
-from server.connections import Connections
-from server.handlers import Handlers
-from server.serving import Serving
-from server.servings import Servings
-from tests.bundles import make_bundle
-from tests.fuzz.model import MAX_BOTS, MAX_CONNECTIONS, TTL_S, Model
-from tests.protocol.golden import TABLE, WELCOME
+from tests.fuzz.world import World
+from tests.protocol.golden import TABLE
 
-__all__ = ["ServerMachine", "World", "run_machine"]
+__all__ = ["ServerMachine"]
 
 RECENT = 7
 PLACES = st.integers(0, RECENT - 1)
@@ -47,48 +26,6 @@ SPOILT = st.sampled_from([None] * 6 + ["BAD_SHAPE", "NON_FINITE", "OUT_OF_RANGE"
 RARELY = st.sampled_from([False, False, True])  # rules are drawn equally often, and these end things
 BUDGETS = [0.0, 5.0, 1e6]
 BY = st.sampled_from([0] * 9 + [1])  # the bots' own connection, or another
-
-
-class World:
-    """The server and the model, made once for all runs: what a run leaves behind is ended before the next."""
-
-    def __init__(self, bundle: Bundle) -> None:
-        self._bundle = bundle
-        self.used: set[int] = set()
-        self.replies = Counter[str]()
-        self._make()
-
-    def _make(self) -> None:
-        self.model, self.now_s = Model(self._bundle), 0.0
-        serving, servings = Serving(self._bundle, max_bots=MAX_BOTS), Servings(max_bots=MAX_BOTS)
-        serving.bots = self.bots = Bots(self._bundle, max_bots=MAX_BOTS, clock=lambda: 0)
-        servings.activate(serving)
-        self.connections = Connections(MAX_CONNECTIONS, TTL_S, lambda: self.now_s)
-        self.handlers = Handlers(servings, self.connections, None)
-
-    def clear(self) -> None:
-        """End everything; begin anew where a divergence has left something."""
-        try:
-            for connection in list(self.connections):
-                self.handlers.end(connection.id)
-            self.model.clear()
-        except (ProtocolError, LookupError):
-            self._make()
-        if (self.bots.n_bots, len(self.connections)) != (0, 0):
-            self._make()
-
-    def wait(self, seconds: float) -> None:
-        """Nothing happens for so long."""
-        self.now_s += seconds
-        self.model.now_s = self.now_s
-
-    def send(self, connection: str | None, **message: Any) -> dict[str, Any]:
-        """The reply to a message, as an engine would read it."""
-        body = msgpack.packb(message)
-        answered = answer(self.handlers, body, Format.MSGPACK, connection, Arrival.now("tcp"))
-        reply = dict(msgpack.unpackb(answered.body))
-        self.replies[reply.get("code", reply["type"])] += 1
-        return reply
 
 
 class ServerMachine(RuleBasedStateMachine):
@@ -277,52 +214,3 @@ def _spoilt(numbers: np.ndarray, how: str | None) -> bytes:
     if how in ("NON_FINITE", "OUT_OF_RANGE"):
         changed.flat[-1] = np.nan if how == "NON_FINITE" else 1e7
     return changed.tobytes()[: -4 if how == "BAD_SHAPE" else None]
-
-
-def run_machine(
-    bundle: Bundle, runs: int, steps: int, *, repeatable: bool = True, phases: Sequence[Phase] = tuple(Phase)
-) -> Counter[str]:
-    """The server's replies by type or code; raises where server and model differ, with a run that shows it."""
-    world = World(bundle)
-    quiet = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
-    how = settings(
-        max_examples=runs,
-        stateful_step_count=steps,
-        derandomize=repeatable,
-        phases=phases,
-        database=None,
-        deadline=None,
-        suppress_health_check=quiet,
-    )
-    run_state_machine_as_test(lambda: ServerMachine(world), settings=how)
-    return world.replies
-
-
-@dataclass(frozen=True)
-class Machine:
-    """Run the state machine; ends with another code than 0 at the first divergence."""
-
-    runs: int = 10_000
-    steps: int = 50
-    json: bool = False  # print one JSON line
-
-
-def main() -> None:
-    """Command line."""
-    config = tyro.cli(Machine, description=__doc__)
-    with tempfile.TemporaryDirectory() as folder:
-        bundle = Bundle.load(make_bundle(Path(folder), features=TABLE, action=WELCOME.action))
-        begun = time.monotonic()
-        replies = run_machine(bundle, config.runs, config.steps, repeatable=False)
-    line: dict[str, Any] = {
-        "runs": config.runs,
-        "steps": config.steps,
-        "seconds": round(time.monotonic() - begun, 1),
-        "divergences": 0,
-    }
-    line |= {"replies": dict(replies.most_common())}
-    print(json.dumps(line) if config.json else "\n".join(f"{key:>12}  {value}" for key, value in line.items()))
-
-
-if __name__ == "__main__":
-    main()

@@ -10,7 +10,7 @@ from hypothesis import Phase
 from bot_runtime.bundle import Bundle
 from server.connections import Connection, Connections
 from tests.bundles import make_bundle
-from tests.fuzz.machine import run_machine
+from tests.fuzz.stateful import run_machine
 from tests.protocol.golden import TABLE, WELCOME
 
 REACHED = {"welcome", "bots_started", "queries", "actions", "bots_stopped", "farewell"} | {
