@@ -51,6 +51,8 @@ bench-peers: $(PEERS)/ready
 bench: $(VENV)/all
 	$(BIN)/python -m benchmarks.latency $(ARGS)
 	$(BIN)/python -m benchmarks.budget $(ARGS)
+	$(BIN)/python -m benchmarks.density $(ARGS)
+	$(BIN)/python -m benchmarks.net_benefit $(ARGS)
 
 # Exact versions of everything, for both set-ups. The CPU build's local version label is taken off torch.
 lock: $(VENV)/all

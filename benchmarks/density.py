@@ -44,7 +44,7 @@ class Density:
     bundle: Path = Path("bundles/hard")
     int8: Path = Path("bundles/hard-int8")  # its int8 variant; left out where there is no such folder
     door: Literal["unix", "tcp"] = "unix"
-    engines: int = 8  # connections that share the bots
+    engines: int = 4  # connections that share the bots
     hz: float = 60.0
     seconds: float = 5.0  # of each run
     attempts: int = 2  # runs that a number of bots has to be carried in one of
@@ -104,9 +104,10 @@ def measure(path: Path, config: Density, processes: int | None, console: Console
             return play_load(url, bundle, golden, shares, config.seconds, config.hz)
 
         def tell(bots: int, load: Load, carried: bool) -> None:
+            server = f"{path.name}, " + ("one server" if processes is None else f"{processes} behind HAProxy")
             console.print(
-                f"{path.name}, {processes or 'no'} behind HAProxy: {bots} bots {'' if carried else 'not '}carried, "
-                f"p50 {load.ms(50.0):.1f} ms, p99 {load.ms(99.0):.1f} ms, generator {100 * load.busy:.0f} % busy"
+                f"{server}: {bots} bots {'' if carried else 'not '}carried, p50 {load.ms(50.0):.1f} ms, "
+                f"p99 {load.ms(99.0):.1f} ms, generator {100 * load.busy:.0f} % busy"
             )
 
         return search(run, config, tell)

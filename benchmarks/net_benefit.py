@@ -39,6 +39,7 @@ from protocol.features import CostModel, FeatureTable
 
 __all__ = ["Net", "NetBenefit", "Spend", "breakeven_bots", "cost_tables", "main", "spend"]
 
+_WIDTH = 120  # of the tables, which have a column for each number of bots
 _SPEND_BOTS = 32  # that play every recorded frame, each with a seed of its own
 
 
@@ -139,7 +140,7 @@ def _tables(net: Net) -> list[Table]:
         title = f"net µs a frame, {name}: {spent.asked_us:.1f} of {spent.all_us:.1f} µs asked for a bot and frame"
         table = Table(title=f"{title} (load {os.getloadavg()[0]:.1f})")
         bots = sorted(next(iter(net.turn_us.values())))
-        for heading in ("transport", *map(str, bots), "breakeven bots"):
+        for heading in ("transport", *map(str, bots), "breaks even"):
             table.add_column(heading, justify="left" if heading == "transport" else "right")
         for transport in net.turn_us:
             cells = (f"{net.us(transport, name, n):,.0f}" for n in bots)
@@ -163,7 +164,7 @@ def main(config: NetBenefit) -> None:
         figure.savefig(config.out.with_suffix(".svg"), metadata={"Date": None})
     if not config.json:
         for table in _tables(net):
-            Console().print(table)
+            Console(width=_WIDTH).print(table)
         return
     breakeven = {
         transport: {table: breakeven_bots(net, transport, table) for table in net.spends} for transport in turn_us

@@ -37,6 +37,7 @@ _FRAME = struct.Struct(">BQ")  # msgpack's 64-bit unsigned integer
 _UINT64 = 0xCF
 _RECORDED = 32  # frames packed beforehand, played over and over
 _TIMEOUT_S = 10.0
+_FIRST_S = 1.0  # of a run, that does not count
 _HOPELESS_S = 1.0  # a frame this late ends the run
 
 
@@ -129,14 +130,15 @@ class Engine:
 
 
 def play_load(url: str, bundle: Bundle, golden: Golden, bots: Sequence[int], seconds: float, hz: float) -> Load:
-    """One engine for each of `bots`, at a random phase of the frame (seeded), for so long. Raises OSError."""
+    """One engine for each of `bots`, at a random phase of the frame (seeded), for so long and a second before that does
+    not count: in it everything is done for the first time. Raises OSError."""
     with ExitStack() as stack:
         engines = []
         for n_bots in bots:
             engines.append(Engine(url, bundle, golden, n_bots))
             stack.callback(engines[-1].socket.close)
         phases = np.random.default_rng(0).uniform(0.0, 1.0, len(engines))
-        n_frames = round(seconds * hz)
+        n_frames, n_first = round((_FIRST_S + seconds) * hz), round(_FIRST_S * hz)
         begun_s = time.monotonic() + 0.05
         at_s = begun_s + (np.arange(n_frames)[:, None] + phases) / hz  # [frames, engines]
         order = np.argsort(at_s, axis=None)
@@ -144,9 +146,10 @@ def play_load(url: str, bundle: Bundle, golden: Golden, bots: Sequence[int], sec
         driven_s = time.monotonic()
         waited_s = _drive(engines, deque(due))
         whole_s = time.monotonic() - driven_s
-    late_ms = np.array([ms for engine in engines for ms in engine.late_ms])
-    given_up = np.full(len(due) - len(late_ms), np.inf)
-    return Load(np.concatenate([late_ms, given_up]), 1.0 - waited_s / whole_s)
+    late_ms = np.full((len(engines), n_frames), np.inf)
+    for row, engine in zip(late_ms, engines, strict=True):
+        row[: len(engine.late_ms)] = engine.late_ms
+    return Load(late_ms[:, n_first:].ravel(), 1.0 - waited_s / whole_s)
 
 
 def _drive(engines: list[Engine], due: deque[tuple[float, Engine]]) -> float:
