@@ -1,4 +1,4 @@
-"""How long work of a size takes, from what it took lately: a high quantile to plan by, and what is usual.
+"""How long work of a size takes, from what it took lately: a median to plan by, and what is usual.
 
 This module knows nothing about what the work is. Sizes that share a power of two share what is known of them.
 """
@@ -34,9 +34,11 @@ class Durations:
             self._by_magnitude[magnitude].add(self._clock(), us)
 
     def predicted_us(self, size: int) -> float:
-        """What nine in ten took at most in the last second, of this size or, where there were none, a smaller one.
+        """The median of the last second, of this size or, where there was none, a smaller one.
 
-        0 where nothing was measured lately: then only trying tells.
+        What is more likely than not to be in time is to be tried, for an overrun has a fallback too: on a machine that
+        others use as well, nine in ten would take many times as long. 0 where nothing was measured lately: then only
+        trying tells.
         """
         now = self._clock()
         with self._lock:
@@ -72,7 +74,7 @@ class _Measured:
         while self._recent and now_ns - self._recent[0][0] > _RECENT_NS:
             self._drop()
         n_recent = len(self._sorted)
-        return self._sorted[n_recent - 1 - n_recent // 10] if n_recent else 0.0
+        return self._sorted[n_recent // 2] if n_recent else 0.0
 
     def _drop(self) -> None:
         _, us = self._recent.popleft()

@@ -15,7 +15,7 @@ from typing import Any
 from protocol import codec
 from protocol.codec import Format
 from protocol.errors import NotReady, ProtocolError
-from protocol.messages import Request, RequestQueries, SubmitFeatures, TakeTurn
+from protocol.messages import Actions, Queries, Request, RequestQueries, SubmitFeatures, TakeTurn
 from server.answer import Answer, Arrival, answer, refusal
 from server.due import Due
 from server.handlers import Handlers
@@ -106,13 +106,19 @@ class Desk:
             )
         arrival = self._due_by(arrival, request.deadline_us)
         turn = type(request), len(request.bots).bit_length()
+        work = type(request), len(request.bots)
         if self._worker.is_idle and self._pace.expected_us(turn) <= self._inline_us:
+            refused = self._refused(arrival, work, reply_form)
+            if refused is not None:
+                return refused
             begun_ns = self._clock()
             answered = answer(self.handlers, request, form, connection_id, arrival, **how)
             self._pace.observe(turn, (self._clock() - begun_ns) / 1e3)
-            return answered if arrival.deadline is None else self.due.kept(arrival.deadline, answered, reply_form)
+            if arrival.deadline is None:
+                return answered
+            self._note(work, answered, how["decoded_ns"])
+            return self.due.kept(arrival.deadline, answered, reply_form)
         job = partial(answer, self.handlers, request, form, connection_id, arrival, **how)
-        work = type(request), len(request.bots)
         return self._in_time(partial(self._timed, turn, job), arrival, work, reply_form)
 
     def end(self, connection_id: str) -> None:
@@ -127,22 +133,32 @@ class Desk:
         self, job: Callable[[], Answer], arrival: Arrival, work: tuple[type[object], int], form: Format
     ) -> Answered:
         """Have the worker do work of this kind and size by its deadline, or refuse it where that cannot be."""
-        expected_us, deadline = self.due.expected_us(*work), arrival.deadline
-        if deadline is not None:
-            refused = self.due.refusal_of(deadline, expected_us, form)
-            if refused is not None:
-                self.handlers.recorder.refused(arrival.transport, NotReady.code)
-                return refused
-        answered = self._hop(partial(self._measured, work, job), arrival, form, expected_us)
-        if deadline is None or isinstance(answered, Answer):
+        refused = self._refused(arrival, work, form)
+        if refused is not None:
+            return refused
+        answered = self._hop(partial(self._measured, work, job), arrival, form, self.due.expected_us(*work))
+        if arrival.deadline is None or isinstance(answered, Answer):
             return answered
-        return self.due.watched(deadline, answered, form)
+        return self.due.watched(arrival.deadline, answered, form)
+
+    def _refused(self, arrival: Arrival, work: tuple[type[object], int], form: Format) -> Answer | None:
+        if arrival.deadline is None:
+            return None
+        refused = self.due.refusal_of(arrival.deadline, self.due.expected_us(*work), form)
+        if refused is not None:
+            self.handlers.recorder.refused(arrival.transport, NotReady.code)
+        return refused
 
     def _measured(self, work: tuple[type[object], int], job: Callable[[], Answer]) -> Answer:
         begun_ns = time.monotonic_ns()
         answered = job()
-        self.due.observe(*work, (time.monotonic_ns() - begun_ns) / 1e3)
+        self._note(work, answered, begun_ns)
         return answered
+
+    def _note(self, work: tuple[type[object], int], answered: Answer, begun_ns: int) -> None:
+        """How long work took that has just ended, if the network was run."""
+        if isinstance(answered.reply, Queries | Actions) and answered.reply.infer_us > 0.0:  # not shed, not refused
+            self.due.observe(*work, (time.monotonic_ns() - begun_ns) / 1e3)
 
     def _hop(self, job: Callable[[], Answer], arrival: Arrival, form: Format, expected_us: float = 0.0) -> Answered:
         try:

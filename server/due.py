@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from bot_runtime.deadline import Deadline
+from bot_runtime.deadline import LEAVE_US, Deadline
 from bot_runtime.durations import Durations
 from protocol import codec
 from protocol.codec import Format
@@ -24,6 +24,7 @@ from server.written import written
 __all__ = ["Due"]
 
 _Kind = type[object]
+_AWAKE_NS = 500_000  # from the end of a look to the next, where the event loop did not sleep in between
 _TICK_US = 1000.0  # the event loop's timers count whole ms, and may be early by one
 
 
@@ -41,21 +42,25 @@ class Due:
         self._default_us = default_us
         self._clock = clock
         self._took: dict[_Kind, Durations] = {}
-        self._round_ns: int | None = None
+        self._round_ns: int | None = None  # when the first request of this look was read
+        self._since_ns = self._last_ns = self._ended_ns = 0
         self.n_refused = self.n_timed_out = self.n_late = 0
 
     def of(self, asked_us: float | None, received_ns: int) -> Deadline | None:
         """The deadline of a request, if it has any; one that is not legal is refused by the handlers.
 
-        Requests that the event loop finds together have all been waiting since it found the first.
+        The event loop finds requests when it looks, and answers some before it looks again. What it finds at a look may
+        have been there since shortly after the one before, so it counts from then, unless the loop has slept since.
         """
         limit_us = self._default_us if asked_us is None else asked_us
         if limit_us is None or not 0.0 <= limit_us <= MAX_DEADLINE_US:
             return None
         if self._round_ns is None:
             self._round_ns = received_ns
+            has_slept = received_ns - self._ended_ns > _AWAKE_NS
+            self._since_ns = received_ns if has_slept else self._last_ns
             asyncio.get_running_loop().call_soon(self._end_round)
-        return Deadline(min(received_ns, self._round_ns), limit_us, self._clock)
+        return Deadline(self._since_ns, limit_us, self._clock)
 
     def expected_us(self, kind: _Kind, size: int) -> float:
         """What a request of this kind and size is expected to take, all in all; 0 where nothing is known."""
@@ -66,13 +71,17 @@ class Due:
         self._took.setdefault(kind, Durations(self._clock)).observe(size, took_us)
 
     def refusal_of(self, deadline: Deadline, expected_us: float, form: Format) -> Answer | None:
-        """The refusal of a request that would wait for too long, if it would."""
-        wait_us = self._worker.backlog_us
-        if wait_us == 0.0 or deadline.left_us() >= wait_us + expected_us:
-            return None  # without a queue it is begun at once, and its bots at least fall back
+        """The refusal of a request that waits for too long, if it does.
+
+        That is quicker than to let its bots fall back, which would cost those that can still be served their time. A
+        deadline that would not do without any waiting either is no reason: then the bots fall back.
+        """
+        left_us, wait_us = deadline.left_us(), self._worker.backlog_us
+        if left_us >= wait_us + expected_us or (wait_us == 0.0 and deadline.limit_us < expected_us + LEAVE_US):
+            return None
         self.n_refused += 1
-        busy = f"{wait_us:.0f} us of work are waiting already, the deadline leaves {deadline.left_us():.0f}"
-        return refusal(NotReady(busy, retry_after_s=wait_us / 1e6), form)
+        busy = f"the deadline leaves {left_us:.0f} us, for {wait_us:.0f} of waiting and {expected_us:.0f} of work"
+        return refusal(NotReady(busy, retry_after_s=max(wait_us, expected_us) / 1e6), form)
 
     def kept(self, deadline: Deadline, answered: Answer, form: Format) -> Answer:
         """The answer as it leaves now: one that is late says so."""
@@ -114,4 +123,5 @@ class Due:
         answered.set_result(self.kept(deadline, Answer(reply, codec.encode(reply, form), 200), form))
 
     def _end_round(self) -> None:
-        self._round_ns = None
+        if self._round_ns is not None:
+            self._last_ns, self._ended_ns, self._round_ns = self._round_ns, self._clock(), None
