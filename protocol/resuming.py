@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from protocol.client import BotClient
-from protocol.errors import NoBot, NoConnection, NotReady, TooManyBots, TooManyConnections
+from protocol.errors import NoBot, NoConnection
 from protocol.features import CostModel
-from protocol.history import Asked, Bot, History, Taken
+from protocol.history import Asked, Bot, History
+from protocol.patience import Patience
+from protocol.replay import rebuild
 from protocol.replies import Actions, Queries, Welcome
 from protocol.transport import ReplyError
 
 __all__ = ["ResumingClient"]
 
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.005, 0.25
-_BUSY = (NotReady, TooManyBots, TooManyConnections)  # a server that starts, or that has not missed us yet
 _MAX_COMPANIES = 256  # bots that were named together, and whose last turn is remembered
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ class ResumingClient:
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
         self._client = BotClient(url, timeout_s=timeout_s)
-        self._limit_s, self._clock, self._sleep = limit_s, clock, sleep
+        self._patience = Patience(limit_s, clock, sleep)
         self._said: dict[str, Any] | None = None
         self._welcome: Welcome | None = None
         self._history = History(1)
@@ -263,58 +263,21 @@ class ResumingClient:
         return [self._handles[number] for number in numbers]
 
     def _through(self, first: Callable[[], T], again: Callable[[], T], *, repeatable: bool = True) -> T:
-        """The answer to `first`, or to `again` once the bots were resumed on another connection.
-
-        A request without an answer is sent again as it is: where the connection lives, that changes nothing unless it
-        is not `repeatable`, and where it does not, the server says so.
-        """
-        if self._said is None:
+        """The answer to `first`, or to `again` once the bots were resumed."""
+        said = self._said
+        if said is None:
             raise NoConnection("say hello first")
-        attempt, lost, give_up_s, pause_s = first, False, float("inf"), _FIRST_PAUSE_S
-        while True:
-            try:
-                if lost:
-                    self._resume(self._said)
-                    attempt, lost = again, False
-                return attempt()
-            except (OSError, NoConnection, *_BUSY) as error:
-                if isinstance(error, _BUSY) and give_up_s == float("inf"):
-                    raise
-                failure = error
-            if lost:
-                self._client.close()  # what was half made ends
-            lost = lost or not repeatable or isinstance(failure, NoConnection)
-            now_s = self._clock()
-            give_up_s = min(give_up_s, now_s + self._limit_s)
-            if now_s >= give_up_s:
-                raise failure
-            self._sleep(pause_s)
-            pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
+        resume = partial(self._resume, said)
+        return self._patience.answer(first, again, resume, self._client.close, repeatable=repeatable)
 
     def _resume(self, said: dict[str, Any]) -> None:
         """A new connection with the same bots, their contexts rebuilt. Raises what BotClient does; NoBot."""
-        was, history = self.welcome, self._history
+        was = self.welcome
         if was.bundle_version is not None:
             said = {**said, "bundle": f"{was.bundle}@{was.bundle_version}"}
         welcome = self._client.hello(**said)
         if welcome.bundle_sha256 != was.bundle_sha256 or welcome.features != was.features:
             raise NoBot("another bundle is served now: the bots cannot be resumed")
-        needed = history.needed()
-        replayed = Counter(number for taken in needed for number in taken.bots)
-        for numbers, arguments in history.groups():
-            turns = [history.bots[number].turns - replayed[number] for number in numbers]
-            handles_N = self._client.start(len(numbers), **arguments, turns=turns)
-            self._handles.update(zip(numbers, handles_N.tolist(), strict=True))
-        self._replay(needed)
+        self._handles = rebuild(self._client, self._history)
         self._welcome = self._client.welcome
         self.resumed += 1
-
-    def _replay(self, needed: list[Taken]) -> None:
-        turns: dict[int, int] = {}
-        for taken in needed:
-            actions = self._client.take(self._now(taken.bots), **taken.again(), hidden=False)
-            turns.update(zip(taken.bots, [] if actions.turns is None else actions.turns.tolist(), strict=True))
-        for number, rebuilt in turns.items():
-            expected = self._history.bots[number].turns
-            if rebuilt != expected:
-                raise NoBot(f"bot {number} cannot be resumed: its context took {rebuilt} turns of {expected}")

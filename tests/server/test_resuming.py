@@ -143,18 +143,18 @@ def test_refusals_come_through_and_change_nothing(tiny: Bundle) -> None:
 
 def test_it_gives_up_after_its_limit_and_can_be_asked_again(tiny: Bundle) -> None:
     mortal, now, pauses = Mortal(tiny, {2: "before"}), [0.0], []
-    client = ResumingClient("tcp://127.0.0.1:1", limit_s=3.0, clock=lambda: now[0], sleep=pauses.append)
+
+    def pause(pause_s: float) -> None:
+        pauses.append(pause_s)
+        now[0] += pause_s
+
+    client = ResumingClient("tcp://127.0.0.1:1", limit_s=3.0, clock=lambda: now[0], sleep=pause)
     client._client._transport = mortal
     client.hello()
     bots = client.start(1, seeds=[1])
     play(client, TABLE, bots, range(1))
     mortal.absence = 10**9
 
-    def pause(pause_s: float) -> None:
-        pauses.append(pause_s)
-        now[0] += pause_s
-
-    client._sleep = pause
     with pytest.raises(ConnectionError):
         client.query(bots, 1, free_numbers(TABLE, 1, 1), [0.25])
     assert 3.0 <= sum(pauses) < 3.5
