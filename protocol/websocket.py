@@ -33,6 +33,8 @@ class WebSocketTransport:
         """See Transport. The socket is the connection, so neither `kind` nor `connection` travels beside the body."""
         try:
             opened = self._socket or self._connect()
+            if self._protocol.state is not State.OPEN:
+                raise self._closed()
             self._protocol.send_binary(body)
             self._flush(opened)
             while not self._messages:
@@ -73,7 +75,11 @@ class WebSocketTransport:
             raise ReplyError(f"the server opened no WebSocket: {self._protocol.handshake_exc}")
         self._flush(opened)
         if not data or (self._protocol.state is not State.OPEN and not self._messages):
-            raise ConnectionResetError(f"the server closed the socket: {self._protocol.close_exc}")
+            raise self._closed()
+
+    def _closed(self) -> ConnectionResetError:
+        said = self._protocol.close_rcvd
+        return ConnectionResetError(f"the server closed the socket: {said or 'without a word'}")
 
     def _take(self, frame: Frame) -> None:
         if frame.opcode is Opcode.BINARY or frame.opcode is Opcode.CONT:

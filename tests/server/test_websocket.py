@@ -225,6 +225,16 @@ def _ping_until_closed(raw: RawSocket) -> None:
         assert raw.frame().opcode is Opcode.PONG
 
 
+def test_a_client_whose_socket_was_closed_hears_of_it_and_connects_again(served: Served) -> None:
+    with BotClient(served.addresses["ws"]) as client:
+        client.hello()
+        client.exchange({"type": "goodbye"})  # upon which the server closes
+        with pytest.raises(ConnectionError):
+            client.start(1)
+        client.hello()
+        assert len(client.start(1)) == 1
+
+
 def test_draining_says_that_the_server_goes_away(bundle: Path, tmp_path: Path) -> None:
     with serve(bundle, tmp_path / "s") as served, _open(served) as raw:
         raw.ask(HELLO)
