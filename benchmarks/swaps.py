@@ -40,7 +40,7 @@ from protocol.client import BotClient
 
 __all__ = ["Engine", "Expected", "Swaps", "main", "measure"]
 
-_TOKEN = "operators"
+_TOKEN = "the-operators-token"
 _TOLERANCE = 1e-5  # of actions; batches of other sizes round otherwise
 _MIN_TELLING = 0.9
 Turn = tuple[np.ndarray, np.ndarray]  # queries [N, M], actions [N, A]

@@ -7,7 +7,6 @@ This module knows nothing about how a version becomes active. Everything is JSON
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -35,6 +34,7 @@ from server.answer import refusal
 from server.catalogue import Catalogue
 from server.handlers import Handlers
 from server.listing import Activate, Rollback, in_memory, listing
+from server.logs import logger
 from server.openapi import ADMIN_ROUTES
 from server.store import Record
 from server.tokens import bearer, check
@@ -45,7 +45,7 @@ __all__ = ["AdminDoor", "add_routes"]
 _MAX_BODY_BYTES = 4096
 _BODY_S = 3.0
 _JSON = Format.JSON.value
-_log = logging.getLogger(__name__)
+_log = logger(__name__)
 T = TypeVar("T", bound=Struct)
 
 
@@ -86,6 +86,11 @@ class AdminDoor:
         catalogue, _ = await self._asked(request, Rollback)
         return _encoded(await catalogue.rollback(request.path_params["name"]))
 
+    def refused(self, request: Request, error: ProtocolError) -> None:
+        """Count it, and say so: whoever guesses tokens here wants more than a bot."""
+        self._handlers.recorder.refused("http", error.code)
+        _log.warning("operator refused", path=request.url.path[:200], code=error.code)
+
     async def _asked(self, request: Request, kind: type[T]) -> tuple[Catalogue, T]:
         self._check_admin(bearer(request.headers.get("authorization", "")))
         if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _JSON:
@@ -106,13 +111,14 @@ def add_routes(app: FastAPI, door: AdminDoor) -> None:
     routes = {"/v1/bundles": (door.bundles, "GET")}
     routes |= {path: (getattr(door, path.rpartition("/")[2]), "POST") for path in ADMIN_ROUTES}
     for path, (exchange, method) in routes.items():
-        app.router.routes.append(Route(path, partial(_answer, exchange), methods=[method]))
+        app.router.routes.append(Route(path, partial(_answer, door, exchange), methods=[method]))
 
 
-async def _answer(exchange: Callable[[Request], Awaitable[bytes]], request: Request) -> Response:
+async def _answer(door: AdminDoor, exchange: Callable[[Request], Awaitable[bytes]], request: Request) -> Response:
     try:
         return Response(await exchange(request), media_type=_JSON)
     except ProtocolError as error:
+        door.refused(request, error)
         return _refused(error)
     except ClientDisconnect:
         return Response(status_code=400)  # nobody is there to read it

@@ -29,16 +29,24 @@ def test_one_folder_or_a_store() -> None:
 
 def test_tokens_come_from_files_too(tmp_path: Path) -> None:
     token, admin = tmp_path / "token", tmp_path / "admin"
-    token.write_text("engines\n")
-    admin.write_text("operators")
+    token.write_text("the engines' token\n")
+    admin.write_text("operators' token")
     assert Settings(bundle=Path("b"), token="t").tokens() == ("t", None)
     settings = Settings(bundle=Path("b"), host="0.0.0.0", token_file=token, admin_token_file=admin)
-    assert settings.tokens() == ("engines", "operators")
+    assert settings.tokens() == ("the engines' token", "operators' token")
     with pytest.raises(ValueError, match="not both"):
         Settings(bundle=Path("b"), token="t", token_file=token)
     with pytest.raises(OSError, match="none"):
         Settings(bundle=Path("b"), token_file=tmp_path / "none").tokens()
-    for content in (b"", b"\n", b"two\nlines\n", b"x" * 1025, b"\xff", b"a\0b"):
+    for content in (
+        b"",
+        b"\n",
+        b"x" * 15,
+        b"two\nlines of a token\n",
+        b"x" * 1025,
+        b"\xff" * 20,
+        b"a token with a\0 in it",
+    ):
         token.write_bytes(content)
         with pytest.raises(ValueError, match=r"token|utf-8"):
             settings.tokens()

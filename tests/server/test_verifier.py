@@ -29,7 +29,7 @@ def test_what_is_wrong_comes_back(bundle: Path, tmp_path: Path) -> None:
 
 
 def test_one_that_takes_too_long_is_ended(bundle: Path) -> None:
-    with pytest.raises(BadBundle, match="more than 0.001 s"):
+    with pytest.raises(BadBundle, match=r"more than 0\.001 s"):
         asyncio.run(verify(bundle, timeout_s=0.001))
     with pytest.raises(ChildProcessError):
         os.waitpid(-1, os.WNOHANG)
