@@ -82,3 +82,36 @@ def test_closing_finishes_what_was_posted() -> None:
     worker.post(lambda: done.append(2))
     worker.close()
     assert done == [1, 2]
+
+
+def test_a_job_that_never_ends_does_not_keep_the_server_from_ending(caplog: pytest.LogCaptureFixture) -> None:
+    worker, reached, release = Worker(max_queue=1), threading.Event(), threading.Event()
+    worker.post(lambda: (reached.set(), release.wait()))
+    reached.wait()
+    worker.close(0.01)
+    assert "did not end" in caplog.text
+    release.set()
+    worker.close()
+
+
+def test_the_backlog_is_what_was_expected_of_all_that_is_not_done() -> None:
+    async def main() -> None:
+        now = [0.0]
+        worker, reached, release = Worker(4, lambda: now[0]), threading.Event(), threading.Event()
+        try:
+            assert worker.backlog_us == 0.0
+            jobs = [worker.run(lambda: (reached.set(), release.wait()), 1000.0), worker.run(lambda: None, 500.0)]
+            await asyncio.to_thread(reached.wait)
+            assert worker.backlog_us == 1500.0
+            now[0] = 0.0004
+            assert worker.backlog_us == pytest.approx(1100.0)
+            now[0] = 9.0  # what takes longer than expected may end at any time
+            assert worker.backlog_us == 500.0
+            release.set()
+            await asyncio.gather(*jobs)
+            assert worker.backlog_us == 0.0
+        finally:
+            release.set()
+            worker.close()
+
+    asyncio.run(main())
