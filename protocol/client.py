@@ -14,8 +14,9 @@ import msgpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from protocol.errors import BadShape, NoConnection, ProtocolError
-from protocol.features import CostModel, FeatureTable
+from protocol.errors import NoConnection, ProtocolError
+from protocol.features import CostModel
+from protocol.packing import add_acquired, add_number, add_numbers, cost_model_dict, handles_of, matrix
 from protocol.replies import (
     Actions,
     Queries,
@@ -69,7 +70,7 @@ class BotClient:
         self._welcome = None
         message: dict[str, Any] = {"type": "hello", "protocol": 1}
         if cost_model is not None:
-            message["cost_model"] = _cost_model_dict(cost_model)
+            message["cost_model"] = cost_model_dict(cost_model)
         if token is not None:
             message["token"] = token
         if bundle is not None:
@@ -94,9 +95,9 @@ class BotClient:
         message: dict[str, Any] = {"type": "start_bots", "count": int(count)}
         if seeds is not None:
             message["seeds"] = [int(seed) for seed in seeds]
-        _add_numbers(message, "target_returns", target_returns)
-        _add_numbers(message, "budgets_us", budgets_us)
-        _add_numbers(message, "target_costs_us", target_costs_us)
+        add_numbers(message, "target_returns", target_returns)
+        add_numbers(message, "budgets_us", budgets_us)
+        add_numbers(message, "target_costs_us", target_costs_us)
         if turns is not None:
             message["turns"] = [int(taken) for taken in turns]
         handles_N, self._welcome = read_bots_started(self.exchange(message), self.welcome)
@@ -120,14 +121,14 @@ class BotClient:
         server has received this its answer must leave; one that cannot be decided by then asks for nothing and says
         so in `reasons`. Raises BadShape locally too.
         """
-        table, handles = self.welcome.features, _handles(bots)
+        table, handles = self.welcome.features, handles_of(bots)
         message = {"type": "request_queries", "frame": int(frame), "bots": handles}
-        message["free"] = _matrix(free, "<f4", (len(handles), table.n_free), "free").tobytes()
-        _add_numbers(message, "rewards", rewards)
-        _add_number(message, "frame_budget_us", frame_budget_us)
-        _add_numbers(message, "budgets_us", budgets_us)
-        _add_numbers(message, "target_costs_us", target_costs_us)
-        _add_number(message, "deadline_us", deadline_us)
+        message["free"] = matrix(free, "<f4", (len(handles), table.n_free), "free").tobytes()
+        add_numbers(message, "rewards", rewards)
+        add_number(message, "frame_budget_us", frame_budget_us)
+        add_numbers(message, "budgets_us", budgets_us)
+        add_numbers(message, "target_costs_us", target_costs_us)
+        add_number(message, "deadline_us", deadline_us)
         return read_queries(self._framed(message), len(handles), table)
 
     def act(
@@ -149,11 +150,11 @@ class BotClient:
         head in the engine reads. `deadline_us` is as in `query`: what is not decided by then is the last action, or a
         safe one. Raises BadShape locally too.
         """
-        welcome, handles = self.welcome, _handles(bots)
+        welcome, handles = self.welcome, handles_of(bots)
         message = {"type": "submit_features", "frame": int(frame), "bots": handles}
-        _add_acquired(message, welcome.features, len(handles), acquired, costly, failed)
-        _add_number(message, "acquire_us", acquire_us)
-        _add_number(message, "deadline_us", deadline_us)
+        add_acquired(message, welcome.features, len(handles), acquired, costly, failed)
+        add_number(message, "acquire_us", acquire_us)
+        add_number(message, "deadline_us", deadline_us)
         if hidden:
             message["hidden"] = True
         return read_actions(self._framed(message), len(handles), welcome.action)
@@ -180,24 +181,24 @@ class BotClient:
         `bot_runtime.head.Head` decides as the server would. A server knows this whose welcome has `replay_frames`.
         Raises OverBudget where what was acquired or failed costs more than a budget; BadShape locally too.
         """
-        welcome, handles = self.welcome, _handles(bots)
+        welcome, handles = self.welcome, handles_of(bots)
         table, message = welcome.features, {"type": "take_turn", "frame": int(frame), "bots": handles}
-        message["free"] = _matrix(free, "<f4", (len(handles), table.n_free), "free").tobytes()
-        _add_acquired(message, table, len(handles), acquired, costly, failed)
-        _add_numbers(message, "rewards", rewards)
-        _add_number(message, "acquire_us", acquire_us)
-        _add_number(message, "frame_budget_us", frame_budget_us)
-        _add_numbers(message, "budgets_us", budgets_us)
-        _add_numbers(message, "target_costs_us", target_costs_us)
+        message["free"] = matrix(free, "<f4", (len(handles), table.n_free), "free").tobytes()
+        add_acquired(message, table, len(handles), acquired, costly, failed)
+        add_numbers(message, "rewards", rewards)
+        add_number(message, "acquire_us", acquire_us)
+        add_number(message, "frame_budget_us", frame_budget_us)
+        add_numbers(message, "budgets_us", budgets_us)
+        add_numbers(message, "target_costs_us", target_costs_us)
         if hidden:
             message["hidden"] = True
-        _add_numbers(message, "replayed_returns_to_go", replayed_returns_to_go)
-        _add_number(message, "deadline_us", deadline_us)
+        add_numbers(message, "replayed_returns_to_go", replayed_returns_to_go)
+        add_number(message, "deadline_us", deadline_us)
         return read_actions(self._framed(message), len(handles), welcome.action)
 
     def stop(self, bots: ArrayLike) -> int:
         """End these bots; returns how many ended."""
-        return int(self.exchange({"type": "stop_bots", "bots": _handles(bots)})["count"])
+        return int(self.exchange({"type": "stop_bots", "bots": handles_of(bots)})["count"])
 
     def close(self) -> None:
         """End the connection and its bots, and close the socket. A server that is gone already is no error."""
@@ -222,49 +223,3 @@ class BotClient:
             self._transport.close()
             raise ReplyError(f"the reply is for frame {reply.get('frame')!r}, expected {message['frame']}")
         return reply
-
-
-def _cost_model_dict(cost_model: CostModel) -> dict[str, Any]:
-    return {"call_us": float(cost_model.call_us), "feature_us": [float(us) for us in cost_model.feature_us]}
-
-
-def _handles(bots: ArrayLike) -> list[int]:
-    handles: list[int] = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
-    return handles
-
-
-def _add_acquired(
-    message: dict[str, Any],
-    table: FeatureTable,
-    n_bots: int,
-    acquired: ArrayLike,
-    costly: ArrayLike,
-    failed: ArrayLike | None,
-) -> None:
-    acquired_NM = _matrix(acquired, "?", (n_bots, table.n_queries), "acquired")
-    costly_ND = _matrix(costly, "<f4", (n_bots, table.n_costly), "costly")
-    message["acquired"] = _pack_bits(acquired_NM)
-    message["values"] = costly_ND[np.repeat(acquired_NM, table.sizes, axis=1)].tobytes()
-    if failed is not None:
-        message["failed"] = _pack_bits(_matrix(failed, "?", acquired_NM.shape, "failed"))
-
-
-def _add_number(message: dict[str, Any], name: str, value: float | None) -> None:
-    if value is not None:
-        message[name] = float(value)
-
-
-def _add_numbers(message: dict[str, Any], name: str, values: ArrayLike | None) -> None:
-    if values is not None:
-        message[name] = np.asarray(values, dtype=np.float64).tolist()
-
-
-def _matrix(array: ArrayLike, dtype: str, shape: tuple[int, ...], name: str) -> NDArray[Any]:
-    matrix = np.ascontiguousarray(array, dtype=dtype)
-    if matrix.shape != shape:
-        raise BadShape(f"{name} has shape {list(matrix.shape)}, expected {list(shape)}")
-    return matrix
-
-
-def _pack_bits(array_NM: NDArray[np.bool_]) -> bytes:
-    return np.packbits(array_NM, axis=1, bitorder="little").tobytes()
