@@ -211,7 +211,8 @@ def summary(phase: Phase, deadline_us: float, way_us: float) -> dict[str, float]
 def recovery_s(phase: Phase, deadline_us: float, way_us: float) -> float:
     """From the beginning of a bearable load to the last answer in its first half that was not a learned one in time.
 
-    Of the first half only: a machine that others use too stalls now and then at any load.
+    Of the first half only: a machine that others use too stalls now and then at any load. As long as that half is: it
+    did not recover within it.
     """
     half_s = phase.begun_s + (phase.answers[-1].at_s - phase.begun_s) / 2 if phase.answers else 0.0
     limit_ms = (deadline_us + way_us) / 1e3
