@@ -10,6 +10,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -83,7 +84,7 @@ def hold(address: str, count: int, wait_s: float) -> list[Held]:
     """Open `count` slow sockets to one door, of all kinds; wait until the server has closed them, at most so long."""
     kinds = [*("reader" for _ in range(min(_READERS, count // 4)))]
     kinds += [KINDS[index % 3] for index in range(count - len(kinds))]
-    opened = _HTTP if address.startswith("http") else _STREAM
+    opened = _OPENED[urlsplit(address).scheme]
     slow = [opened[kind](address) for kind in kinds]
     end_s = time.monotonic() + wait_s
     while time.monotonic() < end_s and any(each.open_s is None for each in slow):
@@ -110,50 +111,103 @@ def _connect(address: str) -> socket.socket:
     return connected
 
 
-def _kind(kind: str, first: bytes = b"", rest: bytes = b"", again: bytes = b"") -> Callable[[str], _Slow]:
-    return lambda address: _Slow(kind, _connect(address), first, rest, again)
+class _Wire(NamedTuple):
+    """How a door's sockets begin, and how a message is written and read there."""
+
+    begin: Callable[[socket.socket, str], None]
+    framed: Callable[[bytes], bytes]
+    read: Callable[[bytes], bytes | None]  # the message's body, None as long as it is not whole
 
 
-def _stream_reader(address: str) -> _Slow:
+def _reader(address: str, wire: _Wire) -> _Slow:
     """Starts bots, asks for a frame, and then for the same again, without ever reading another answer."""
     connected = _connect(address)
-    welcome = _told(connected, {"type": "hello"})
-    bots = _told(connected, {"type": "start_bots", "count": _READERS_BOTS})["bots"]
+    wire.begin(connected, address)
+
+    def told(message: dict[str, Any]) -> dict[str, Any]:
+        connected.sendall(wire.framed(msgpack.packb(message)))
+        data = b""
+        while (body := wire.read(data)) is None:
+            data += _received(connected)
+        return dict(msgpack.unpackb(body))
+
+    welcome = told({"type": "hello"})
+    bots = told({"type": "start_bots", "count": _READERS_BOTS})["bots"]
     free = [each for each in welcome["features"]["features"] if each["cost_us"] == 0.0]
     numbers = [each["low"] for each in free for _ in range(each["size"])] * _READERS_BOTS
     packed = struct.pack(f"<{len(numbers)}f", *numbers)
     query = {"type": "request_queries", "frame": 0, "bots": bots, "free": packed}
-    _told(connected, query)
-    return _Slow("reader", connected, b"", b"", _framed(query))
+    told(query)
+    return _Slow("reader", connected, b"", b"", wire.framed(msgpack.packb(query)))
 
 
-def _told(connected: socket.socket, message: dict[str, Any]) -> dict[str, Any]:
-    """The reply to a message, read as anybody would."""
-    connected.sendall(_framed(message))
-    data = b""
-    while len(data) < 4 or len(data) < 4 + int.from_bytes(data[:4], "big"):
-        part = connected.recv(65536)
-        if not part:
-            raise ConnectionResetError("the server closed the socket")
-        data += part
-    return dict(msgpack.unpackb(data[4:]))
+def _slow_body(address: str, wire: _Wire) -> _Slow:
+    """The beginning of a message of 1,000 bytes."""
+    connected = _connect(address)
+    wire.begin(connected, address)
+    whole = wire.framed(b"\xc0" * 1000)
+    return _Slow("body", connected, whole[:-1000], whole[-1000:], b"")
 
 
-def _framed(message: dict[str, Any]) -> bytes:
-    body = msgpack.packb(message)
-    return struct.pack(">I", len(body)) + body
+def _received(connected: socket.socket) -> bytes:
+    part = connected.recv(65536)
+    if not part:
+        raise ConnectionResetError("the server closed the socket")
+    return part
 
 
+def _begin_nothing(connected: socket.socket, address: str) -> None:
+    """A stream's first byte is its first message's."""
+
+
+def _begin_websocket(connected: socket.socket, address: str) -> None:
+    head = f"GET {urlsplit(address).path} HTTP/1.1\r\nHost: {urlsplit(address).netloc}\r\nUpgrade: websocket\r\n"
+    head += "Connection: Upgrade\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+    connected.sendall(head.encode())
+    answer = b""
+    while not answer.endswith(b"\r\n\r\n"):
+        answer += _received(connected)
+
+
+def _stream_body(data: bytes) -> bytes | None:
+    return data[4:] if len(data) >= 4 + int.from_bytes(data[:4], "big") > 4 else None
+
+
+def _websocket_frame(body: bytes) -> bytes:
+    """RFC 6455, 5.2: a whole binary message, with a mask of zeros."""
+    if len(body) < 126:
+        return bytes((0x82, 0x80 | len(body))) + bytes(4) + body
+    return struct.pack(">BBH", 0x82, 0xFE, len(body)) + bytes(4) + body
+
+
+def _websocket_body(data: bytes) -> bytes | None:
+    if len(data) < 10:
+        return None
+    head, size = {126: (4, data[2:4]), 127: (10, data[2:10])}.get(data[1], (2, data[1:2]))
+    return data[head:] if len(data) >= head + int.from_bytes(size, "big") else None
+
+
+def _kind(kind: str, first: bytes = b"", rest: bytes = b"", again: bytes = b"") -> Callable[[str], _Slow]:
+    return lambda address: _Slow(kind, _connect(address), first, rest, again)
+
+
+_STREAM = _Wire(_begin_nothing, lambda body: struct.pack(">I", len(body)) + body, _stream_body)
+_WEBSOCKET = _Wire(_begin_websocket, _websocket_frame, _websocket_body)
 _HEADER = b"POST /v1/query HTTP/1.1\r\nHost: a\r\nContent-Type: application/msgpack\r\n"
-_HTTP = {
-    "silent": _kind("silent"),
-    "header": _kind("header", first=_HEADER[:1], rest=_HEADER[1:]),
-    "body": _kind("body", first=_HEADER + b"Content-Length: 1000\r\n\r\n", rest=b"\xc0" * 1000),
-    "reader": _kind("reader", again=b"GET /v1/bundle HTTP/1.1\r\nHost: a\r\n\r\n"),
-}
-_STREAM = {
+_BY_HTTP = {"silent": _kind("silent"), "header": _kind("header", first=_HEADER[:1], rest=_HEADER[1:])}
+_BY_STREAM = {
     "silent": _kind("silent"),
     "header": _kind("header", first=b"\0", rest=struct.pack(">I", 1000)[1:]),
-    "body": _kind("body", first=struct.pack(">I", 1000), rest=b"\xc0" * 1000),
-    "reader": _stream_reader,
+    "body": partial(_slow_body, wire=_STREAM),
+    "reader": partial(_reader, wire=_STREAM),
+}
+_OPENED: dict[str, dict[str, Callable[[str], _Slow]]] = {
+    "http": _BY_HTTP
+    | {
+        "body": _kind("body", first=_HEADER + b"Content-Length: 1000\r\n\r\n", rest=b"\xc0" * 1000),
+        "reader": _kind("reader", again=b"GET /v1/bundle HTTP/1.1\r\nHost: a\r\n\r\n"),
+    },
+    "ws": _BY_HTTP | {"body": partial(_slow_body, wire=_WEBSOCKET), "reader": partial(_reader, wire=_WEBSOCKET)},
+    "tcp": _BY_STREAM,
+    "unix": _BY_STREAM,
 }

@@ -1,4 +1,4 @@
-"""Slow sockets, in short: each kind is closed by each stream door; how soon is for the benchmark to say."""
+"""Slow sockets, in short: each kind is closed by each door of sockets; how soon is for the benchmark to say."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.bundles import make_bundle
 from tests.server.serving import serve
 
 
-@pytest.mark.parametrize("door", ["tcp", "unix"])
+@pytest.mark.parametrize("door", ["ws", "tcp", "unix"])
 def test_every_kind_of_slow_socket_is_closed(tmp_path: Path, door: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.slow_clients._ASKED_A_TICK", 4000)  # nobody else is here to be slowed
     bundle = make_bundle(tmp_path / "tiny")
@@ -32,7 +32,7 @@ def test_sockets_that_are_not_closed_are_found(tmp_path: Path) -> None:
 def test_a_run_visits_every_door(tmp_path: Path) -> None:
     config = SlowSockets(make_bundle(tmp_path / "tiny"), 4, bots=1, quiet_s=0.1, deadline_s=0.2, patience_s=0.5)
     doors = measure(config)
-    assert {"http", "tcp", "unix"} <= set(doors)
+    assert {"http", "ws", "tcp", "unix"} <= set(doors)
     assert all(door.sockets == 4 and door.p99_us > 0.0 for door in doors.values())
 
 
