@@ -47,7 +47,8 @@ def _shaken(graph: bytes, seed: int) -> bytes:
         weights = numpy_helper.to_array(tensor)
         if seed and weights.dtype == np.float32 and weights.ndim >= 2:
             noise = random.normal(0.0, _SHAKEN * float(weights.std()), weights.shape)
-            tensor.CopyFrom(numpy_helper.from_array((weights + noise).astype(np.float32), tensor.name))
+            shaken = weights + noise * (weights != 0.0)  # zeros are there for what must not be read
+            tensor.CopyFrom(numpy_helper.from_array(shaken.astype(np.float32), tensor.name))
     return bytes(model.SerializeToString())
 
 
