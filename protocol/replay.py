@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections import Counter
 
 from protocol.client import BotClient
-from protocol.errors import NoBot
+from protocol.errors import NotReady
 from protocol.history import History
+from protocol.messages import MAX_DEADLINE_US
 
 __all__ = ["rebuild"]
 
@@ -17,8 +18,10 @@ __all__ = ["rebuild"]
 def rebuild(client: BotClient, history: History) -> dict[int, int]:
     """Handles by bot, once every context is what it was (PROTOCOL.md, *Resume*, steps 2 and 3).
 
-    Raises what BotClient does; NoBot where a context did not take the turns that it took before.
+    Raises what BotClient does; NotReady where a context did not take the turns that it took before, since the server
+    was too busy to infer. No turn of before has a deadline, whatever the server's default is.
     """
+    deadline_us = None if client.welcome.deadline_us is None else MAX_DEADLINE_US
     needed, handles = history.needed(), dict[int, int]()
     replayed = Counter(number for taken in needed for number in taken.bots)
     for numbers, arguments in history.groups():
@@ -27,10 +30,12 @@ def rebuild(client: BotClient, history: History) -> dict[int, int]:
         handles.update(zip(numbers, started_N.tolist(), strict=True))
     turns: dict[int, int] = {}
     for taken in needed:
-        actions = client.take([handles[number] for number in taken.bots], **taken.again(), hidden=False)
+        actions = client.take(
+            [handles[number] for number in taken.bots], **taken.again(), hidden=False, deadline_us=deadline_us
+        )
         turns.update(zip(taken.bots, [] if actions.turns is None else actions.turns.tolist(), strict=True))
     for number, rebuilt in turns.items():
         expected = history.bots[number].turns
         if rebuilt != expected:
-            raise NoBot(f"bot {number} cannot be resumed: its context took {rebuilt} turns of {expected}")
+            raise NotReady(f"bot {number} is not resumed yet: its context took {rebuilt} turns of {expected}")
     return handles

@@ -46,7 +46,7 @@ class Welcome(NamedTuple):
     `target_cost_us` is None where the bundle is not conditioned on its budget, and `cost_quantile` where the server
     takes no measurements; both from a server that is older than the field. `bundle_version` is None where the server
     keeps no versions; `bundle_sha256`, the hash of the manifest, only from an older server, as are `replay_frames` and
-    `target_return`.
+    `target_return`. `deadline_us` is None where requests have none unless they name it.
     """
 
     connection: str
@@ -64,6 +64,7 @@ class Welcome(NamedTuple):
     bundle_sha256: str | None = None
     replay_frames: int | None = None
     target_return: float | None = None
+    deadline_us: float | None = None
 
 
 class Queries(NamedTuple):
@@ -128,6 +129,7 @@ def read_welcome(reply: dict[str, Any]) -> Welcome:
             **_read_version(reply),
             replay_frames=None if replay_frames is None else int(replay_frames),
             target_return=_float(reply.get("target_return")),
+            deadline_us=_float(reply.get("deadline_us")),
         )
 
 

@@ -39,7 +39,7 @@ class Mortal:
         self.bundle, self.deaths, self._broken = bundle, deaths, broken or {}
         self.requests = self.lives = self.absent = 0
         self.absence = 2  # refused attempts between one and the next
-        self._handlers = self._born()
+        self.handlers = self._born()
 
     def exchange(self, kind: str, body: bytes, connection: str | None) -> bytes:
         """See Transport."""
@@ -51,7 +51,7 @@ class Mortal:
         self.requests += self._counts(message)
         if death == "before":
             self._die()
-        replies = answer(self._handlers, body, Format.MSGPACK, connection, Arrival.now("tcp"))
+        replies = answer(self.handlers, body, Format.MSGPACK, connection, Arrival.now("tcp"))
         if death == "after":
             self._die()
         return replies.body
@@ -64,7 +64,7 @@ class Mortal:
         return not resuming
 
     def _die(self) -> None:
-        self._handlers, self.absent = self._born(), self.absence
+        self.handlers, self.absent = self._born(), self.absence
         raise ConnectionResetError("the server has died")
 
     def _born(self) -> Handlers:

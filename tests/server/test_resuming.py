@@ -190,3 +190,43 @@ def test_a_line_that_is_cut_is_no_death(served: Served, door: str) -> None:
             played += play(client, TABLE, bots, range(frame, frame + 1))
         assert same(played, play(unbroken, TABLE, unbroken.start(2, seeds=[1, 2]), range(12)))
         assert client.resumed == (0 if door == "http" else 12)
+
+
+def test_costs_are_learned_again_from_the_turns_that_are_replayed(tiny: Bundle) -> None:
+    mortal = Mortal(tiny, {})
+    client = resuming(mortal)
+    client.hello()
+    bots = client.start(2, seeds=[1, 2])
+
+    def turns(frames: range) -> None:
+        for frame in frames:
+            query = client.query(bots, frame, free_numbers(TABLE, 2, frame)).queries
+            client.act(bots, frame, query, costly_numbers(TABLE, 2, frame), acquire_us=40.0)
+
+    turns(range(20))
+    (before,) = mortal.handlers.costs()
+    mortal.deaths[mortal.requests] = "before"
+    turns(range(20, 21))
+    (after,) = mortal.handlers.costs()
+    depth = client.welcome.replay_frames
+    assert client.resumed == 1
+    assert before.frames > after.frames > 0
+    assert after.frames <= depth + 1
+    assert after.rows[0].declared_us == before.rows[0].declared_us
+
+
+def test_a_server_that_is_too_busy_to_rebuild_is_asked_again(tiny: Bundle) -> None:
+    """A replayed turn that no context took: once it comes out of the network as NaN, then no more."""
+    broken: dict[int, list[int]] = {}
+    mortal = Mortal(tiny, {}, broken)
+    client, unbroken = resuming(mortal), resuming(Mortal(tiny, {}))
+    for each in (client, unbroken):
+        each.hello()
+    bots, own = client.start(3, seeds=[1, 2, 3]), unbroken.start(3, seeds=[1, 2, 3])
+    played = play(client, TABLE, bots, range(12))
+    broken[10] = [0, 1, 2]
+    mortal.deaths[mortal.requests] = "before"
+    client._patience._sleep = lambda pause_s: broken.clear() if mortal.absent == 0 and client.resumed == 0 else None
+    played += play(client, TABLE, bots, range(12, 16))
+    assert same(played, play(unbroken, TABLE, own, range(16)))
+    assert client.resumed == 1
