@@ -23,7 +23,7 @@ _TICK_S = 0.02
 _BYTE_EVERY_S = 1.0
 _READERS = 4  # of each door: a server has to fill the buffers of each before it can notice
 _RECEIVE_BYTES = 4096
-_ASKED_A_TICK = 16
+_ASKED_A_TICK = 4
 _READERS_BOTS = 32  # of each such client: the more, the longer the answers
 
 BOTS = _READERS * _READERS_BOTS
