@@ -21,8 +21,9 @@ __all__ = ["CONFIG", "Front", "FrontFailed", "configured"]
 
 CONFIG = Path(__file__).parent.parent / "docker" / "haproxy" / "haproxy.cfg"
 _HOST = "127.0.0.1"
-_START_S = 10.0
+_START_S = 60.0
 _STOP_S = 5.0
+_PATIENT = "    timeout connect 60s\n    timeout check 60s"  # a process that is slow is not dead: that one refuses
 _POLL_S = 0.02
 
 
@@ -33,11 +34,13 @@ class FrontFailed(Exception):
 class Front:
     """HAProxy on free ports of loopback for as long as the `with` block lasts; `http` and `tcp` are where it listens.
 
-    `servers` are the addresses of each process, named p1, p2 and so on in this order.
+    `servers` are the addresses of each process, named p1, p2 and so on in this order. One that `is_patient` waits a
+    minute for their answers to its checks: on a machine that is busy with other things they are late, not gone.
     """
 
-    def __init__(self, servers: Sequence[dict[str, str]]) -> None:
+    def __init__(self, servers: Sequence[dict[str, str]], *, is_patient: bool = False) -> None:
         self._servers = servers
+        self._is_patient = is_patient
         self.http, self.tcp = "", ""
 
     def __enter__(self) -> Self:
@@ -47,7 +50,10 @@ class Front:
         self.http, self.tcp = f"http://{_HOST}:{http}", f"tcp://{_HOST}:{tcp}"
         self._folder = tempfile.TemporaryDirectory(prefix="front-")
         path = Path(self._folder.name) / "haproxy.cfg"
-        path.write_text(configured(CONFIG.read_text(encoding="utf-8"), self._servers, http, tcp), encoding="utf-8")
+        shipped = CONFIG.read_text(encoding="utf-8")
+        if self._is_patient:
+            shipped = shipped.replace("    timeout connect 1s", _PATIENT)
+        path.write_text(configured(shipped, self._servers, http, tcp), encoding="utf-8")
         # -db: in the foreground, so that it ends with this process's signals and not after them.
         self._process = subprocess.Popen([found, "-db", "-f", str(path)], stdin=subprocess.DEVNULL)
         try:

@@ -43,7 +43,6 @@ from server.worker import Worker
 __all__ = ["AdminDoor", "add_routes"]
 
 _MAX_BODY_BYTES = 4096
-_BODY_S = 3.0
 _JSON = Format.JSON.value
 _log = logger(__name__)
 T = TypeVar("T", bound=Struct)
@@ -59,11 +58,13 @@ class AdminDoor:
         catalogue: Catalogue | None,
         *,
         admin_token: str | None,
+        body_deadline_s: float,
     ) -> None:
         self._handlers = handlers
         self._worker = worker
         self._catalogue = catalogue
         self._admin_token = admin_token
+        self._body_deadline_s = body_deadline_s
 
     async def bundles(self, request: Request) -> bytes:
         """Everything that there is to serve; needs the server's token, if it has one, or the admin token."""
@@ -95,10 +96,22 @@ class AdminDoor:
         self._check_admin(bearer(request.headers.get("authorization", "")))
         if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _JSON:
             raise UnsupportedMediaType(f"expected content type {_JSON}")
-        asked = codec.decode(await _body(request), Format.JSON, kind)
+        asked = codec.decode(await self._body(request), Format.JSON, kind)
         if self._catalogue is None:
             raise NoBundle("this server serves one folder: it has no store of versions")
         return self._catalogue, asked
+
+    async def _body(self, request: Request) -> bytes:
+        body = bytearray()
+        try:
+            async with asyncio.timeout(self._body_deadline_s):
+                async for chunk in request.stream():
+                    body += chunk
+                    if len(body) > _MAX_BODY_BYTES:
+                        raise TooLarge(f"the body has more than the limit of {_MAX_BODY_BYTES} bytes")
+        except TimeoutError:
+            raise BadJson(f"the body did not end within {self._body_deadline_s:g} s") from None
+        return bytes(body)
 
     def _check_admin(self, given: str | None) -> None:
         if self._admin_token is None:
@@ -125,19 +138,6 @@ async def _answer(door: AdminDoor, exchange: Callable[[Request], Awaitable[bytes
     except OSError:
         _log.exception("the store cannot be used")
         return _refused(InternalError("the store cannot be used; the server's log says why"))
-
-
-async def _body(request: Request) -> bytes:
-    body = bytearray()
-    try:
-        async with asyncio.timeout(_BODY_S):
-            async for chunk in request.stream():
-                body += chunk
-                if len(body) > _MAX_BODY_BYTES:
-                    raise TooLarge(f"the body has more than the limit of {_MAX_BODY_BYTES} bytes")
-    except TimeoutError:
-        raise BadJson(f"the body did not end within {_BODY_S:g} s") from None
-    return bytes(body)
 
 
 def _encoded(record: Record) -> bytes:

@@ -64,7 +64,13 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
     async with AsyncExitStack() as stack:
         worker = Worker(settings.max_queue)
         stack.callback(worker.close, _CLOSE_S)
-        admin = AdminDoor(handlers, worker, _filled(servings, worker, settings), admin_token=admin_token)
+        admin = AdminDoor(
+            handlers,
+            worker,
+            _filled(servings, worker, settings),
+            admin_token=admin_token,
+            body_deadline_s=settings.frame_deadline_s,
+        )
         desk = Desk(handlers, worker, inline_us=settings.inline_us, due=Due(worker, default_us=default_us))
         sockets = Sockets(
             desk,

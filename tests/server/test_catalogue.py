@@ -19,6 +19,9 @@ from tests.bundles import make_bundle, rehash
 from tests.server.serving import HttpAnswer, Served, http_request, play, same, serve
 
 ADMIN, TOKEN = "the-operators-token", "the-engines-token"
+WAIT_S = 60.0
+"""For any answer: these tests must not fail because a machine is busy. Longer where a process is started."""
+VERIFIED_WITHIN_S = 300.0
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +43,8 @@ def store(made: Path, tmp_path: Path) -> Path:
 def settings(store: Path, tmp_path: Path) -> dict[str, Any]:
     for name, token in (("admin", ADMIN), ("token", TOKEN)):
         (tmp_path / name).write_text(token + "\n")
-    return {"store": store, "admin_token_file": tmp_path / "admin", "token_file": tmp_path / "token"}
+    tokens = {"admin_token_file": tmp_path / "admin", "token_file": tmp_path / "token"}
+    return {"store": store, "frame_deadline_s": WAIT_S, **tokens}
 
 
 @pytest.fixture
@@ -52,11 +56,12 @@ def served(settings: dict[str, Any], tmp_path: Path) -> Iterator[Served]:
 def admin(served: Served, path: str, body: Any = None, token: str | None = ADMIN) -> HttpAnswer:
     headers = {"Content-Type": "application/json"} | ({} if token is None else {"Authorization": f"Bearer {token}"})
     address, content = served.addresses["http"], json.dumps(body or {})
-    return http_request(address, "POST", f"/v1/bundles/{path}", content, headers, timeout_s=120.0)  # a process starts
+    return http_request(address, "POST", f"/v1/bundles/{path}", content, headers, timeout_s=VERIFIED_WITHIN_S)
 
 
 def listed(served: Served, token: str = TOKEN) -> dict[str, Any]:
-    answer = http_request(served.addresses["http"], "GET", "/v1/bundles", headers={"Authorization": f"Bearer {token}"})
+    headers = {"Authorization": f"Bearer {token}"}
+    answer = http_request(served.addresses["http"], "GET", "/v1/bundles", headers=headers, timeout_s=WAIT_S)
     assert answer.status == 200
     return {entry["name"]: entry for entry in json.loads(answer.body)}
 
@@ -66,7 +71,7 @@ def code(answer: HttpAnswer) -> tuple[int, str]:
 
 
 def hello(served: Served, bundle: str | None = "tiny", door: str = "unix") -> BotClient:
-    client = BotClient(served.addresses[door])
+    client = BotClient(served.addresses[door], timeout_s=WAIT_S)
     client.hello(token=TOKEN, bundle=bundle)
     return client
 
