@@ -83,11 +83,15 @@ class Connections:
 
     def get(self, connection_id: str | None) -> Connection:
         """The connection of this name, which is thereby heard from; raises NoConnection, also if it is overdue."""
-        connection = self._by_id.get(connection_id) if connection_id is not None else None
+        connection = self.peek(connection_id)
         if connection is None or self._is_silent(connection):
             raise NoConnection("say hello first" if connection_id is None else "no such connection: say hello again")
         connection.last_seen_s = self._clock()
         return connection
+
+    def peek(self, connection_id: str | None) -> Connection | None:
+        """The connection of this name if there is one, which is not thereby heard from; from any thread."""
+        return self._by_id.get(connection_id) if connection_id is not None else None
 
     def remove(self, connection_id: str) -> Connection | None:
         """Forget a connection, and return it if there was one."""

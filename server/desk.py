@@ -19,46 +19,24 @@ from protocol.messages import Actions, Queries, Request, RequestQueries, SubmitF
 from server.answer import Answer, Arrival, answer, refusal
 from server.due import Due
 from server.handlers import Handlers
+from server.pace import Kind, Pace
 from server.worker import Worker
 
-__all__ = ["Desk", "Pace"]
+__all__ = ["Desk"]
 
 _MAX_INLINE_BYTES = 16384  # decoding so much takes less than a turn
 _TURNS = RequestQueries, SubmitFeatures, TakeTurn
-_Kind = tuple[type[Request], int]  # and the number of bits in its number of bots: sizes within a factor of two
 
 Answered = Answer | asyncio.Future[Answer]
-
-
-class Pace:
-    """How long requests take, by kind and size: about their 90 % quantile, by steps up and down, in µs.
-
-    One odd measurement doubles an estimate; it takes ten good ones to take that back.
-    """
-
-    def __init__(self) -> None:
-        self._us: dict[_Kind, float] = {}
-
-    def expected_us(self, kind: _Kind) -> float:
-        """What the next one is expected to take; infinite before the first."""
-        return self._us.get(kind, float("inf"))
-
-    def observe(self, kind: _Kind, took_us: float) -> None:
-        """One has taken so long."""
-        known_us = self._us.get(kind)
-        if known_us is None:
-            self._us[kind] = took_us
-        else:
-            self._us[kind] = known_us * (2.0 if took_us > known_us else 0.93)
 
 
 class Desk:
     """Answers requests of every door in the order in which they come, one at a time.
 
-    A turn is answered before `ask` returns if the worker is idle and turns like it take at most `inline_us`. That is
-    how long one client's request may hold up the event loop: one that is larger, or of a size that was not met before,
-    never does. `clock` counts ns; so does `worker_clock`, but only while its thread runs: the worker also waits for
-    the interpreter, which the event loop would not.
+    A turn is answered before `ask` returns if the worker is idle and turns like it, of the same bundle, take at most
+    `inline_us`. That is how long one client's request may hold up the event loop: one that is larger, or of a size that
+    was not met before, never does. `clock` counts ns; so does `worker_clock`, but only while its thread runs: the
+    worker also waits for the interpreter, which the event loop would not.
     """
 
     def __init__(
@@ -77,7 +55,6 @@ class Desk:
         self._inline_us = inline_us
         self._clock = clock
         self._worker_clock = worker_clock
-        self._pace = Pace()
 
     def ask(
         self,
@@ -107,19 +84,20 @@ class Desk:
         arrival = self._due_by(arrival, request.deadline_us)
         turn = type(request), len(request.bots).bit_length()
         work = type(request), len(request.bots)
-        if self._worker.is_idle and self._pace.expected_us(turn) <= self._inline_us:
+        pace = self.handlers.pace_of(connection_id)
+        if self._worker.is_idle and pace.expected_us(turn) <= self._inline_us:
             refused = self._refused(arrival, work, reply_form)
             if refused is not None:
                 return refused
             begun_ns = self._clock()
             answered = answer(self.handlers, request, form, connection_id, arrival, **how)
-            self._pace.observe(turn, (self._clock() - begun_ns) / 1e3)
+            pace.observe(turn, (self._clock() - begun_ns) / 1e3)
             if arrival.deadline is None:
                 return answered
             self._note(work, answered, how["decoded_ns"])
             return self.due.kept(arrival.deadline, answered, reply_form)
         job = partial(answer, self.handlers, request, form, connection_id, arrival, **how)
-        return self._in_time(partial(self._timed, turn, job), arrival, work, reply_form)
+        return self._in_time(partial(self._timed, pace, turn, job), arrival, work, reply_form)
 
     def end(self, connection_id: str) -> None:
         """End a connection whose socket has closed, after what was asked for on it."""
@@ -167,8 +145,8 @@ class Desk:
             self.handlers.recorder.refused(arrival.transport, error.code)
             return refusal(error, form)
 
-    def _timed(self, turn: _Kind, job: Callable[[], Answer]) -> Answer:
+    def _timed(self, pace: Pace, turn: Kind, job: Callable[[], Answer]) -> Answer:
         begun_ns = self._worker_clock()
         answered = job()
-        self._pace.observe(turn, (self._worker_clock() - begun_ns) / 1e3)
+        pace.observe(turn, (self._worker_clock() - begun_ns) / 1e3)
         return answered

@@ -37,6 +37,7 @@ from protocol.messages import (
 )
 from server.connections import Connection, Connections
 from server.logs import digest, logger
+from server.pace import Pace
 from server.recorder import Recorder
 from server.serving import Serving
 from server.servings import Servings
@@ -68,11 +69,17 @@ class Handlers:
         self._token = token
         self._default_deadline_us = default_deadline_us
         self.recorder = Recorder()
+        self._strangers = Pace()
 
     @property
     def max_body_bytes(self) -> dict[Format, int]:
         """The longest message that is read, by format; safe to read from any thread."""
         return self.servings.max_body_bytes
+
+    def pace_of(self, connection_id: str | None) -> Pace:
+        """Of what this connection's bots are served; safe on the event loop."""
+        connection = self._connections.peek(connection_id)
+        return self._strangers if connection is None else connection.serving.pace
 
     def handle(
         self, request: Request, connection_id: str | None, form: Format, deadline: Deadline | None = None

@@ -13,6 +13,7 @@ from bot_runtime.manifest import Manifest
 from protocol.codec import Format, body_limit
 from protocol.features import CostModel, FeatureTable
 from protocol.messages import Welcome
+from server.pace import Pace
 
 __all__ = ["Serving"]
 
@@ -20,14 +21,15 @@ __all__ = ["Serving"]
 class Serving:
     """A verified bundle with room for `max_bots` bots. `n_connections` hold it: it lives until the last lets go.
 
-    `version` is its number in the store, None where there is none. `bots` and `n_connections` belong to the worker; the
-    rest never changes.
+    `version` is its number in the store, None where there is none. `bots` and `n_connections` belong to the worker;
+    `pace` to whoever answers; the rest never changes.
     """
 
     def __init__(self, bundle: Bundle, *, max_bots: int, version: int | None = None) -> None:
         self.bots = Bots(bundle, max_bots=max_bots)
         self.version = version
         self.n_connections = 0
+        self.pace = Pace()
         self.max_body_bytes = {form: body_limit(self.table, max_bots, form) for form in Format}
 
     @property

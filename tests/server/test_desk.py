@@ -8,20 +8,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgpack
-import numpy as np
 import pytest
 
 from bot_runtime.bundle import Bundle
 from protocol.codec import Format
-from protocol.messages import RequestQueries, SubmitFeatures
 from server import desk as module
 from server.answer import Answer, Arrival, answer
 from server.connections import Connections
-from server.desk import Desk, Pace
+from server.desk import Desk
 from server.handlers import Handlers
 from server.serving import Serving
 from server.servings import Servings
 from server.worker import Worker
+from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE
 from tests.server.serving import free_numbers
 
@@ -54,8 +53,10 @@ class Counter:
     def put(self, message: dict[str, object]) -> Answer | asyncio.Future[Answer]:
         return self.desk.ask(msgpack.packb(message), Format.MSGPACK, self.connection, Arrival.now("tcp"))
 
-    async def start(self, count: int) -> list[int]:
-        welcome, _ = await self.ask({"type": "hello"})
+    async def start(self, count: int, bundle: str | None = None) -> list[int]:
+        """Bots of a new connection, which is from now on the one that asks."""
+        self.connection = None
+        welcome, _ = await self.ask({"type": "hello", "bundle": bundle})
         self.connection = str(welcome["connection"])
         started, _ = await self.ask({"type": "start_bots", "count": count})
         return list(started["bots"])
@@ -63,7 +64,7 @@ class Counter:
     async def query(self, bots: list[int]) -> bool:
         """Whether the next frame's query of these bots was answered on the event loop."""
         reply, inline = await self.ask(self.request(bots))
-        assert reply["type"] == "queries"
+        assert reply["type"] == "queries", reply
         return inline
 
     def request(self, bots: list[int]) -> dict[str, object]:
@@ -165,14 +166,17 @@ def test_only_small_turns_and_refusals_are_answered_on_the_loop(at_desk: Callabl
     at_desk(test)
 
 
-def test_an_estimate_follows_the_ninth_of_ten_measurements() -> None:
-    pace, rng = Pace(), np.random.default_rng(0)
-    kind = RequestQueries, 3
-    assert pace.expected_us(kind) == float("inf")
-    times_us = rng.uniform(0.0, 1000.0, 4000)
-    below = []
-    for took_us in times_us:
-        below.append(took_us <= pace.expected_us(kind))
-        pace.observe(kind, float(took_us))
-    assert 0.87 < np.mean(below[1000:]) < 0.94
-    assert pace.expected_us((SubmitFeatures, 3)) == float("inf")
+def test_a_slow_bundle_beside_a_fast_one_never_borrows_its_pace(at_desk: Callable[..., None], tmp_path: Path) -> None:
+    async def test(counter: Counter) -> None:
+        slow = Serving(Bundle.load(make_bundle(tmp_path / "slow", name="slow", features=TABLE)), max_bots=8)
+        counter.desk.handlers.servings.activate(slow)
+        fast_bots = await counter.start(1, "tiny")
+        fast = counter.connection
+        assert [await counter.query(fast_bots) for _ in range(3)] == [False, True, True]
+        bots = await counter.start(1, "slow")
+        counter.us = 5000.0
+        assert not any([await counter.query(bots) for _ in range(5)])
+        counter.us, counter.connection = 10.0, fast
+        assert await counter.query(fast_bots)
+
+    at_desk(test)
