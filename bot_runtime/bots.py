@@ -30,7 +30,7 @@ from bot_runtime.slots import Slots
 from bot_runtime.spending import Limits, Spending
 from bot_runtime.spent import Spent
 from bot_runtime.step import Chance, Step
-from bot_runtime.turns import Actions, Queries, Turn, Turns
+from bot_runtime.turns import UNMEASURED, Actions, Queries, Turn, Turns
 from protocol.errors import BadSchema, FrameReused
 from protocol.features import CostModel
 from protocol.messages import MAX_RETURN, MAX_RETURN_TO_GO
@@ -305,8 +305,7 @@ class Bots:
 
 def _measured(acquire_us: float | None) -> _Floats:
     """[1], or empty where nothing was measured. Raises NonFinite, OutOfRange."""
-    measured = () if acquire_us is None else (acquire_us,)
-    return inputs.per_bot("acquire_us", measured, len(measured), 0.0, MAX_ACQUIRE_US)
+    return UNMEASURED if acquire_us is None else inputs.per_bot("acquire_us", (acquire_us,), 1, 0.0, MAX_ACQUIRE_US)
 
 
 def _check_same(content: tuple[NDArray[np.generic], ...], kept: tuple[NDArray[np.generic], ...], frame: int) -> None:

@@ -51,7 +51,7 @@ class Request(NamedTuple):
         if rewards is not None:
             rewards_N = inputs.per_bot("rewards", rewards, n_bots, -MAX_RETURN, MAX_RETURN)
         limits, means = NOTHING_SAID, company.means
-        if any(said is not None for said in (budgets_us, target_costs_us, frame_budget_us, costs)):
+        if not (budgets_us is None and target_costs_us is None and frame_budget_us is None and costs is None):
             limits = Limits.checked(n_bots, budgets_us, target_costs_us, frame_budget_us)
             means = Means.of(spending.terms(company.slots_N, limits, costs))
         return cls(free_NF.copy(), rewards_N, limits, means)

@@ -18,9 +18,10 @@ from bot_runtime.fallback import Cause, Counters, non_finite
 from protocol.errors import FrameReused, NoPendingQuery
 from protocol.turn import Event, Phase, is_retry, transition
 
-__all__ = ["Actions", "Queries", "Turn", "Turns"]
+__all__ = ["UNMEASURED", "Actions", "Queries", "Turn", "Turns"]
 
 
+UNMEASURED = np.zeros(0)
 _NONE = 0  # the turn id of a bot that has had no turn
 _Ints = NDArray[np.int64]
 
@@ -79,9 +80,7 @@ class Turn:
     target_cost_N: NDArray[np.float32]
     is_prepared: bool  # whether the acquisition graph has run: if not, it does before the action graph
     actions: Actions | None = None
-    measured_us: NDArray[np.float64] = field(
-        default_factory=lambda: np.zeros(0)
-    )  # what acquiring took, [1], where the engine says so
+    measured_us: NDArray[np.float64] = field(default_factory=lambda: UNMEASURED)  # what acquiring took, [1], if said
     taken: bool = False  # both halves came at once, in a `take_turn`
     key: int = _NONE  # in `Turns`
     members: int = 0  # how many of its bots have begun no other turn since, and are still there

@@ -39,6 +39,8 @@ def bits(blob: Bits, shape: tuple[int, int], name: str) -> NDArray[np.bool_]:
         raise BadShape(f"{name} has {len(blob)} bytes, expected {rows} rows of {row_bytes} ({columns} bits)")
     packed = np.frombuffer(blob, dtype=np.uint8).reshape(rows, row_bytes)
     unpacked = np.unpackbits(packed, axis=1, bitorder="little").view(np.bool_)
+    if unpacked.shape[1] == columns:
+        return unpacked
     if unpacked[:, columns:].any():
         raise BadShape(f"{name} sets bits beyond the last of {columns} features")
     return unpacked[:, :columns]
@@ -63,7 +65,7 @@ def unpack_values(values: Blob, acquired_NM: NDArray[np.bool_], table: FeatureTa
 
     Raises BadShape (too few or too many numbers for what `acquired` says), OutOfRange as `floats` does.
     """
-    present_ND = acquired_NM[:, table.owner]
+    present_ND = acquired_NM.take(table.owner, axis=1)
     dense_ND = np.zeros(present_ND.shape, dtype=np.float32)
     dense_ND[present_ND] = _ragged(values, present_ND)
     return dense_ND

@@ -42,6 +42,7 @@ class BotClient:
 
     def __init__(self, url: str, *, timeout_s: float = 5.0) -> None:
         self._transport = open_transport(url, timeout_s)
+        self._packer = msgpack.Packer()  # kept, for each begins with a large buffer
         self._welcome: Welcome | None = None
 
     def __enter__(self) -> Self:
@@ -214,7 +215,7 @@ class BotClient:
     def exchange(self, message: dict[str, Any]) -> dict[str, Any]:
         """Send any message, as a dict, and return its reply's dict: the door for tests and for messages to come."""
         connection = None if self._welcome is None else self._welcome.connection
-        body = self._transport.exchange(message["type"], msgpack.packb(message), connection)
+        body = self._transport.exchange(message["type"], self._packer.pack(message), connection)
         return read_reply(body, message["type"])
 
     def _framed(self, message: dict[str, Any]) -> dict[str, Any]:

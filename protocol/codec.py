@@ -28,6 +28,8 @@ _FIXED_BYTES = 16384  # names, brackets, the longest token with every character 
 _MAX_JSON_LISTS = 4 * MAX_BOTS_PER_MESSAGE + 4096
 
 Message = TypeVar("Message", bound=msgspec.Struct)
+_Decoder = msgspec.msgpack.Decoder[Any] | msgspec.json.Decoder[Any]
+_Encoder = msgspec.msgpack.Encoder | msgspec.json.Encoder
 
 
 class Format(Enum):
@@ -72,29 +74,33 @@ def decode(body: bytes, form: Format, message: type[Message]) -> Message:
 
     Raises BadMsgpack or BadJson (malformed, truncated, trailing bytes), TooDeep, BadSchema.
     """
-    return cast("Message", _decode(body, form, message))
+    return cast("Message", _decode(body, form, _decoder(form, message)))
 
 
 def decode_request(body: bytes, form: Format) -> Request:
     """One request of whichever type its `type` field names; raises as `decode` does."""
-    return cast("Request", _decode(body, form, Request))
+    return cast("Request", _decode(body, form, _REQUESTS[form]))
 
 
 def encode(message: msgspec.Struct, form: Format) -> bytes:
     """The bytes of one message. Its blobs must already be in this format (`protocol.arrays`)."""
-    return msgspec.msgpack.encode(message) if form is Format.MSGPACK else msgspec.json.encode(message)
+    return _ENCODERS[form].encode(message)
 
 
 @cache
-def _decoder(form: Format, message: Any) -> msgspec.msgpack.Decoder[Any] | msgspec.json.Decoder[Any]:
+def _decoder(form: Format, message: Any) -> _Decoder:
     return msgspec.msgpack.Decoder(message) if form is Format.MSGPACK else msgspec.json.Decoder(message)
 
 
-def _decode(body: bytes, form: Format, message: Any) -> Any:
+_REQUESTS = {form: _decoder(form, Request) for form in Format}  # to hash a union takes longer than to decode
+_ENCODERS: dict[Format, _Encoder] = {Format.MSGPACK: msgspec.msgpack.Encoder(), Format.JSON: msgspec.json.Encoder()}
+
+
+def _decode(body: bytes, form: Format, decoder: _Decoder) -> Any:
     if form is Format.JSON and body.count(b"[") > _MAX_JSON_LISTS:
         raise _refusal(body, form, msgspec.ValidationError("more lists than any message has"))
     try:
-        return _decoder(form, message).decode(body)
+        return decoder.decode(body)
     except RecursionError:
         raise TooDeep("the body is nested deeper than any message") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

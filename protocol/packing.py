@@ -23,7 +23,7 @@ def cost_model_dict(cost_model: CostModel) -> dict[str, Any]:
 
 def handles_of(bots: ArrayLike) -> list[int]:
     """One handle or many, as a list."""
-    handles: list[int] = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
+    handles: list[int] = np.array(bots, dtype=np.int64, ndmin=1).tolist()
     return handles
 
 
@@ -39,7 +39,7 @@ def add_acquired(
     acquired_NM = matrix(acquired, "?", (n_bots, table.n_queries), "acquired")
     costly_ND = matrix(costly, "<f4", (n_bots, table.n_costly), "costly")
     message["acquired"] = _pack_bits(acquired_NM)
-    message["values"] = costly_ND[np.repeat(acquired_NM, table.sizes, axis=1)].tobytes()
+    message["values"] = costly_ND[acquired_NM.take(table.owner, axis=1)].tobytes()
     if failed is not None:
         message["failed"] = _pack_bits(matrix(failed, "?", acquired_NM.shape, "failed"))
 

@@ -98,9 +98,11 @@ class Actions(NamedTuple):
 
 def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
     """The reply's fields; raises the ProtocolError that an `error` message names, ReplyError if this is no answer."""
-    with _Reading(request_type):
-        reply = dict(msgpack.unpackb(body, max_array_len=min(_MAX_ARRAY, len(body))))
-        kind = reply["type"]
+    try:
+        reply: dict[str, Any] = msgpack.unpackb(body, max_array_len=min(_MAX_ARRAY, len(body)))
+        kind = reply["type"]  # what is no map has no field of this name either
+    except _FAULTS as error:
+        raise _unreadable(request_type, error) from error
     if kind == "error":
         raise _refused(reply)
     if kind != _REPLY_TO[request_type]:
@@ -110,7 +112,7 @@ def read_reply(body: bytes, request_type: str) -> dict[str, Any]:
 
 def read_welcome(reply: dict[str, Any]) -> Welcome:
     """The fields of a `welcome`; raises ReplyError."""
-    with _Reading("hello"):
+    try:
         replay_frames = reply.get("replay_frames")
         return Welcome(
             connection=str(reply["connection"]),
@@ -131,6 +133,8 @@ def read_welcome(reply: dict[str, Any]) -> Welcome:
             target_return=_float(reply.get("target_return")),
             deadline_us=_float(reply.get("deadline_us")),
         )
+    except _FAULTS as error:
+        raise _unreadable("hello", error) from error
 
 
 def _float(number: Any) -> float | None:
@@ -139,24 +143,29 @@ def _float(number: Any) -> float | None:
 
 def read_bots_started(reply: dict[str, Any], welcome: Welcome) -> tuple[NDArray[np.int64], Welcome]:
     """The handles of a `bots_started`, and `welcome` with the version that these bots are of; raises ReplyError."""
-    with _Reading("start_bots"):
+    try:
         return np.array(reply["bots"], dtype=np.int64), welcome._replace(**_read_version(reply))
+    except _FAULTS as error:
+        raise _unreadable("start_bots", error) from error
 
 
 def read_queries(reply: dict[str, Any], bots: int, table: FeatureTable) -> Queries:
     """The fields of a `queries` for N = `bots`; raises ReplyError."""
-    with _Reading("request_queries"):
+    try:
         bytes_NB = np.frombuffer(reply["queries"], dtype=np.uint8).reshape(bots, -(-table.n_queries // 8))
         queries_NM = np.unpackbits(bytes_NB, axis=1, count=table.n_queries, bitorder="little").view(np.bool_)
         cost_us_N = np.array(reply["cost_us"], dtype=np.float64).reshape(bots)
-        reasons_N = _reasons(reply.get("reasons") or [0] * bots, bots)
+        reasons = reply.get("reasons")
+        reasons_N = _reasons(reasons, bots) if reasons else np.zeros(bots, dtype=np.uint8)
         infer_us, late = float(reply["infer_us"]), bool(reply.get("late"))
         return Queries(int(reply["frame"]), queries_NM, cost_us_N, infer_us, reasons_N, late)
+    except _FAULTS as error:
+        raise _unreadable("request_queries", error) from error
 
 
 def read_actions(reply: dict[str, Any], bots: int, action: ActionSpec) -> Actions:
     """The fields of an `actions` for N = `bots`; raises ReplyError."""
-    with _Reading("submit_features"):
+    try:
         actions_NA = np.frombuffer(reply["actions"], dtype="<f4").reshape(bots, action.size)
         reasons_N = _reasons(reply["reasons"], bots)
         infer_us, late = float(reply["infer_us"]), bool(reply.get("late"))
@@ -164,6 +173,8 @@ def read_actions(reply: dict[str, Any], bots: int, action: ActionSpec) -> Action
         turns_N = None if turns is None else np.array(turns, dtype=np.int64).reshape(bots)
         hidden_NW = None if hidden is None else np.frombuffer(hidden, dtype="<f4").reshape(bots, -1)
         return Actions(int(reply["frame"]), actions_NA, reasons_N, infer_us, turns_N, hidden_NW, late)
+    except _FAULTS as error:
+        raise _unreadable("submit_features", error) from error
 
 
 def _reasons(reasons: list[int], bots: int) -> NDArray[np.uint8]:
@@ -183,18 +194,8 @@ def _known(kind: type[Feature | ActionComponent], fields: dict[str, Any]) -> dic
     return {name: fields[name] for name in kind.__struct_fields__}
 
 
-class _Reading:
-    """What fails within is no reply that the protocol allows. A class: a generator takes three times as long."""
-
-    def __init__(self, request_type: str) -> None:
-        self._request_type = request_type
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, _FAULTS):
-            raise ReplyError(f"the reply to {self._request_type} is not what the protocol says: {error!r}") from error
+def _unreadable(request_type: str, error: Exception) -> ReplyError:
+    return ReplyError(f"the reply to {request_type} is not what the protocol says: {error!r}")
 
 
 def _refused(reply: dict[str, Any]) -> ProtocolError:

@@ -20,6 +20,7 @@ class Phase(Enum):
     IDLE = "idle"  # started, no frame yet
     PENDING = "pending"  # a query was answered, features are awaited
     ANSWERED = "answered"  # features came, the action was answered
+    __hash__ = object.__hash__  # of Enum's own, every look-up in the table pays for a call
 
 
 class Event(Enum):
@@ -28,6 +29,7 @@ class Event(Enum):
     QUERY = "request_queries"
     FEATURES = "submit_features"
     TURN = "take_turn"  # both at once
+    __hash__ = object.__hash__
 
 
 class Order(Enum):
@@ -36,6 +38,7 @@ class Order(Enum):
     OLDER = "older frame"
     SAME = "same frame"
     NEWER = "newer frame"
+    __hash__ = object.__hash__
 
 
 TRANSITIONS: dict[tuple[Phase, Event, Order], Phase | type[ProtocolError]] = {
