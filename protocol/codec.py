@@ -53,6 +53,7 @@ def body_limit(table: FeatureTable, max_bots: int, form: Format) -> int:
     """Bytes of the largest message that can make sense: `max_bots` bots of this table, in lists of the widest numbers.
 
     A bot has at most F + 4 numbers, D numbers and 2 M bits in a whole turn, and 5 numbers in a start.
+    With no bots it is the largest hello.
     """
     number_bytes = _NUMBER_BYTES[form]
     per_turn = number_bytes * (table.n_free + table.n_costly + 4) + 2 * _BIT_BYTES * table.n_queries

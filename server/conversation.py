@@ -53,6 +53,9 @@ class Conversation(asyncio.Protocol):
     def _framed(self, body: bytes) -> bytes:
         """A reply as it travels."""
 
+    def _welcomed(self, welcome: Welcome) -> None:  # most need do nothing about it
+        """Hello was answered: longer messages may come from now on."""
+
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See asyncio.Protocol."""
         self._transport = cast("asyncio.Transport", transport)
@@ -130,6 +133,7 @@ class Conversation(asyncio.Protocol):
         self.is_busy = False
         if isinstance(answered.reply, Welcome):
             self._connection = answered.reply.connection
+            self._welcomed(answered.reply)
         if self._is_over:  # the client has left in the meantime
             if isinstance(answered.reply, Welcome):
                 self._sockets.desk.end(answered.reply.connection)

@@ -13,7 +13,15 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from protocol import messages
 from protocol.codec import Format
-from protocol.errors import BadJson, BadMsgpack, MethodNotAllowed, ProtocolError, TooLarge, UnsupportedMediaType
+from protocol.errors import (
+    BadJson,
+    BadMsgpack,
+    MethodNotAllowed,
+    NoConnection,
+    ProtocolError,
+    TooLarge,
+    UnsupportedMediaType,
+)
 from server.answer import Answer, Arrival, refusal
 from server.desk import Desk
 from server.openapi import CONNECTION_HEADER, ROUTES
@@ -53,11 +61,11 @@ class Exchange:
                 raise MethodNotAllowed(f"{scope['method']} {scope['path']} is not served")
             form = _content_type(headers.get(b"content-type", b""))
             reply_form = reply_form or form
-            body = await self._body(headers, receive, form)
-            if body is None:
-                return  # nobody is there to read an answer
             named = None if kind is messages.Hello else headers.get(_CONNECTION_HEADER)
             connection = None if named is None else named.decode("latin-1")
+            body = await self._body(headers, receive, form, connection)
+            if body is None:
+                return  # nobody is there to read an answer
             arrival = Arrival.now("http")
             answered = self._desk.ask(body, form, connection, arrival, kind=kind, reply_form=reply_form)
             if not isinstance(answered, Answer):
@@ -67,14 +75,15 @@ class Exchange:
             reply_form = reply_form or Format.JSON
             answered = refusal(error, reply_form)
             # Part of the body may still be on its way.
-            may_go_on = not isinstance(error, TooLarge | BadMsgpack | BadJson)
+            may_go_on = not isinstance(error, TooLarge | NoConnection | BadMsgpack | BadJson)
         await _send(send, answered, reply_form, may_go_on)
 
-    async def _body(self, headers: _Headers, receive: Receive, form: Format) -> bytes | None:
-        """The whole body; None where the client has left."""
-        limit = self._desk.handlers.max_body_bytes[form]
+    async def _body(self, headers: _Headers, receive: Receive, form: Format, connection: str | None) -> bytes | None:
+        """The whole body; None where the client has left. One too long of a connection that has ended: NoConnection."""
+        limit = self._desk.handlers.max_bytes(connection, form)
         announced = headers.get(b"content-length", b"0")
         if not announced.isdigit() or len(announced) > 18 or int(announced) > limit:
+            self._check_known(connection)
             raise TooLarge(f"the body has {announced[:20].decode('latin-1')} bytes, the limit is {limit}")
         body = bytearray()
         try:
@@ -85,12 +94,18 @@ class Exchange:
                         return None
                     body += message["body"]
                     if len(body) > limit:
+                        self._check_known(connection)
                         raise TooLarge(f"the body has more than the limit of {limit} bytes")
                     if not message.get("more_body"):
                         return bytes(body)
         except TimeoutError:
             truncated = BadMsgpack if form is Format.MSGPACK else BadJson
             raise truncated(f"the body did not end within {self._body_deadline_s:g} s") from None
+
+    def _check_known(self, connection: str | None) -> None:
+        """What is too long for a stranger need not be for an engine, which must learn that it is to say hello again."""
+        if connection is not None and self._desk.handlers.connections.peek(connection) is None:
+            raise NoConnection("no such connection: say hello again")
 
 
 async def _send(send: Send, answered: Answer, form: Format, may_go_on: bool) -> None:

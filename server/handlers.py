@@ -65,20 +65,20 @@ class Handlers:
         default_deadline_us: float | None = None,
     ) -> None:
         self.servings = servings
-        self._connections = connections
+        self.connections = connections
         self._token = token
         self._default_deadline_us = default_deadline_us
         self.recorder = Recorder()
         self._strangers = Pace()
 
-    @property
-    def max_body_bytes(self) -> dict[Format, int]:
-        """The longest message that is read, by format; safe to read from any thread."""
-        return self.servings.max_body_bytes
+    def max_bytes(self, connection_id: str | None, form: Format) -> int:
+        """The longest message that is read from this connection, or from a stranger: hello. Safe from any thread."""
+        is_known = self.connections.peek(connection_id) is not None
+        return (self.servings.max_body_bytes if is_known else self.servings.max_hello_bytes)[form]
 
     def pace_of(self, connection_id: str | None) -> Pace:
         """Of what this connection's bots are served; safe on the event loop."""
-        connection = self._connections.peek(connection_id)
+        connection = self.connections.peek(connection_id)
         return self._strangers if connection is None else connection.serving.pace
 
     def handle(
@@ -87,7 +87,7 @@ class Handlers:
         """The reply to one request, its blobs written for `form`. Raises ProtocolError, having done nothing."""
         if isinstance(request, Hello):
             return self._hello(request, connection_id, form)
-        connection = self._connections.get(connection_id)
+        connection = self.connections.get(connection_id)
         match request:
             case RequestQueries():
                 return self._request_queries(request, connection, form, deadline)
@@ -105,18 +105,18 @@ class Handlers:
 
     def end(self, connection_id: str, why: str = "socket closed") -> None:
         """End a connection and its bots; one that has ended already is no error."""
-        connection = self._connections.remove(connection_id)
+        connection = self.connections.remove(connection_id)
         if connection is not None:
             self._let_go(connection, why)
 
     def end_silent(self) -> None:
         """End every connection that has been silent for longer than its time to live."""
-        for connection in self._connections.remove_silent():
+        for connection in self.connections.remove_silent():
             self._let_go(connection, "silence")
 
     def costs(self) -> list[Report]:
         """What acquiring costs each connection's engine, in the order in which they connected."""
-        return [connection.costs.report() for connection in self._connections]
+        return [connection.costs.report() for connection in self.connections]
 
     def check_token(self, token: str | None) -> None:
         """Raise Unauthorized unless this is the server's token, or it has none. Takes equally long either way."""
@@ -134,7 +134,7 @@ class Handlers:
         check_costs(cost_model, serving.table)
         self.end_silent()
         is_pinned = hello.bundle is not None and "@" in hello.bundle
-        connection = self._connections.open(cost_model, serving, is_pinned=is_pinned)
+        connection = self.connections.open(cost_model, serving, is_pinned=is_pinned)
         self.servings.hold(serving)
         welcome = serving.welcome(connection.id, cost_model, connection.costs.quantile, form)
         return replace(welcome, deadline_us=self._default_deadline_us)

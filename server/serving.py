@@ -31,6 +31,7 @@ class Serving:
         self.n_connections = 0
         self.pace = Pace()
         self.max_body_bytes = {form: body_limit(self.table, max_bots, form) for form in Format}
+        self.max_hello_bytes = {form: body_limit(self.table, 0, form) for form in Format}
 
     @property
     def name(self) -> str:

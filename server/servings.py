@@ -1,7 +1,7 @@
 """Servings: the active bundle of each name, and earlier ones that connections still hold.
 
-This module knows nothing about files, messages or transports. It belongs to the worker; only `max_body_bytes`, which
-is replaced whole, may be read from elsewhere.
+This module knows nothing about files, messages or transports. It belongs to the worker; only `max_body_bytes`
+and `max_hello_bytes`, which are replaced whole, may be read from elsewhere.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ class Servings:
         self._max_bots = max_bots
         self._max_loaded = max_loaded
         self.max_body_bytes = dict.fromkeys(Format, 0)
+        self.max_hello_bytes = dict.fromkeys(Format, 0)
 
     def __iter__(self) -> Iterator[Serving]:
         return iter(tuple(self._loaded))
@@ -112,5 +113,6 @@ class Servings:
             self._limit_bodies()
 
     def _limit_bodies(self) -> None:
-        """The longest message that any of them can make sense of: whose it is, is known only once it is read."""
+        """The longest message and hello that any of them can make sense of: whose one is, is known once it is read."""
         self.max_body_bytes = {form: max(serving.max_body_bytes[form] for serving in self._loaded) for form in Format}
+        self.max_hello_bytes = {form: max(serving.max_hello_bytes[form] for serving in self._loaded) for form in Format}

@@ -38,7 +38,7 @@ class StreamSocket(Conversation):
         if len(buffer) < _PREFIX.size:
             return None
         (size,) = _PREFIX.unpack_from(buffer)
-        limit = self._sockets.desk.handlers.max_body_bytes[Format.MSGPACK]
+        limit = self._sockets.desk.handlers.max_bytes(self._connection, Format.MSGPACK)
         if size > limit:
             self._refuse(TooLarge(f"the frame has {size} bytes, the limit is {limit}"))
             return None

@@ -22,6 +22,7 @@ from websockets.typing import Origin
 
 from protocol.codec import Format
 from protocol.errors import ProtocolError, TooLarge, TooManyConnections
+from protocol.messages import Welcome
 from protocol.transport import SOCKET_PATH
 from server.conversation import Conversation
 from server.sockets import Sockets
@@ -43,7 +44,7 @@ class WebSocket(Conversation):
         super().__init__(sockets, "ws")
         self._protocol = ServerProtocol(
             origins=[None, *(cast("Origin", origin) for origin in origins)],
-            max_size=sockets.desk.handlers.max_body_bytes[Format.MSGPACK],
+            max_size=sockets.desk.handlers.max_bytes(None, Format.MSGPACK),
             logger=_library_log,
         )
         self._bodies: deque[bytes] = deque()
@@ -79,6 +80,9 @@ class WebSocket(Conversation):
     @property
     def _has_part(self) -> bool:
         return bool(self._bodies) or self._fragments is not None or self._is_within_frame
+
+    def _welcomed(self, welcome: Welcome) -> None:
+        self._protocol.max_message_size = welcome.max_body_bytes
 
     def _framed(self, body: bytes) -> bytes:
         self._protocol.send_binary(body)

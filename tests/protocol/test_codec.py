@@ -164,6 +164,9 @@ def test_the_widest_messages_fit_the_limit(max_bots: int) -> None:
     for message in messages:
         assert len(msgspec.json.encode(message)) + 64 <= codec.body_limit(TABLE, max_bots, Format.JSON)
         assert len(msgpack.packb(message)) + 64 <= codec.body_limit(TABLE, max_bots, Format.MSGPACK)
+    hello = {"type": "hello", **messages[-1], "token": "\U0001f916" * 1024, "bundle": "b" * 74}
+    assert len(json.dumps(hello)) + 64 <= codec.body_limit(TABLE, 0, Format.JSON)  # 12 characters for each of them
+    assert len(msgpack.packb(hello)) + 64 <= codec.body_limit(TABLE, 0, Format.MSGPACK)
 
 
 @pytest.mark.parametrize("form", list(Format))

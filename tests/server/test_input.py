@@ -6,6 +6,7 @@ import json
 import struct
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -15,11 +16,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from protocol.client import BotClient
+from protocol.codec import Format, body_limit
 from protocol.errors import ERRORS_BY_CODE, TooManyBots
+from protocol.features import CostModel
 from tests.protocol.golden import BOTS, REFUSED, REQUESTS, TABLE, VECTORS, Vector
-from tests.server.serving import RawStream, Served, free_numbers, http_request
+from tests.server.serving import RawStream, Served, free_numbers, http_request, serve
 
 MSGPACK = {"Content-Type": "application/msgpack"}
+LONGEST_HELLO = body_limit(TABLE, 0, Format.MSGPACK)
 PATHS = ["/v1/connections", "/v1/bots/start", "/v1/query", "/v1/act", "/v1/bots/stop", "/v1/connections/close"]
 
 
@@ -153,13 +157,47 @@ def test_a_frame_of_the_limit_is_read(stream: RawStream, served: Served) -> None
 @pytest.mark.parametrize("path", PATHS)
 def test_a_body_over_the_limit_is_413_before_it_is_decoded_or_even_read(served: Served, path: str) -> None:
     with BotClient(served.addresses["http"]) as client:
-        limit = client.hello().max_body_bytes
-    announced = {**MSGPACK, "Content-Length": str(limit + 1)}
-    answer = http_request(served.addresses["http"], "POST", path, b"", announced)  # nothing of it is ever sent
-    assert (answer.status, msgpack.unpackb(answer.body)["code"]) == (413, "TOO_LARGE")
-    chunks = (bytes(4096) for _ in range(limit // 4096 + 1))  # without a length: Transfer-Encoding: chunked
-    answer = http_request(served.addresses["http"], "POST", path, chunks, MSGPACK)
-    assert (answer.status, msgpack.unpackb(answer.body)["code"]) == (413, "TOO_LARGE")
+        welcome = client.hello()
+        limit = LONGEST_HELLO if path == PATHS[0] else welcome.max_body_bytes
+        headers = {**MSGPACK, "X-Bot-Connection": welcome.connection}
+        announced = {**headers, "Content-Length": str(limit + 1)}
+        answer = http_request(served.addresses["http"], "POST", path, b"", announced)  # nothing of it is ever sent
+        assert (answer.status, msgpack.unpackb(answer.body)["code"]) == (413, "TOO_LARGE")
+        chunks = (bytes(4096) for _ in range(limit // 4096 + 1))  # without a length: Transfer-Encoding: chunked
+        answer = http_request(served.addresses["http"], "POST", path, chunks, headers)
+        assert (answer.status, msgpack.unpackb(answer.body)["code"]) == (413, "TOO_LARGE")
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("named", [None, "0" * 32])
+def test_without_a_connection_nothing_longer_than_a_hello_is_read(served: Served, path: str, named: str | None) -> None:
+    headers = MSGPACK if named is None else {**MSGPACK, "X-Bot-Connection": named}
+    too_long = (413, "TOO_LARGE") if named is None or path == PATHS[0] else (404, "NO_CONNECTION")
+    announced = {**headers, "Content-Length": str(LONGEST_HELLO + 1)}
+    answer = http_request(served.addresses["http"], "POST", path, b"", announced)
+    assert (answer.status, msgpack.unpackb(answer.body)["code"]) == too_long
+    assert answer.headers["connection"] == "close"
+    chunks = (bytes(4096) for _ in range(LONGEST_HELLO // 4096 + 1))
+    answer = http_request(served.addresses["http"], "POST", path, chunks, headers)
+    assert (answer.status, msgpack.unpackb(answer.body)["code"]) == too_long
+
+
+@pytest.mark.parametrize("door", ["tcp", "unix"])
+def test_before_hello_a_stream_reads_no_more_than_a_hello(served: Served, door: str) -> None:
+    with RawStream(served.addresses[door]) as raw:
+        assert raw.frame(b"\xc0" * LONGEST_HELLO)["code"] == "BAD_MSGPACK"
+        raw.socket.sendall(struct.pack(">I", LONGEST_HELLO + 1))
+        assert raw.reply()["code"] == "TOO_LARGE"
+        assert raw.ended()
+
+
+@pytest.mark.parametrize("door", ["http", "tcp", "ws"])
+def test_the_longest_hello_is_read(bundle: Path, tmp_path: Path, door: str) -> None:
+    token = "\U0001f916" * 1024
+    model = CostModel(call_us=1 / 3, feature_us=(2 / 3,) * TABLE.n_queries)
+    with serve(bundle, tmp_path / "s", token=token) as served, BotClient(served.addresses[door]) as client:
+        assert client.hello(token=token, bundle="tiny", cost_model=model).bundle == "tiny"
+        client.start(40, seeds=[2**63 - 1] * 40, budgets_us=[1 / 3] * 40, target_returns=[1 / 3] * 40)
 
 
 @pytest.mark.parametrize("media_type", ["application/json", "application/msgpack"])
@@ -169,7 +207,8 @@ def test_each_format_has_its_own_limit_and_welcome_names_it(served: Served, medi
         return answer.status, (json.loads if media_type.endswith("json") else msgpack.unpackb)(answer.body)
 
     _, welcome = answered(b"{}" if media_type.endswith("json") else b"\x80")
-    limit = welcome["max_body_bytes"]
+    assert welcome["max_body_bytes"] == body_limit(TABLE, welcome["max_bots"], Format(media_type))
+    limit = body_limit(TABLE, 0, Format(media_type))
     assert answered(b"\xc1" * limit)[0] == 400
     status, refused = answered(b"\xc1" * (limit + 1))
     assert (status, refused["code"]) == (413, "TOO_LARGE")

@@ -101,11 +101,12 @@ def test_max_bots_counts_the_bots_of_all_of_them(versions: list[Bundle]) -> None
 
 
 def test_the_longest_message_is_that_of_whatever_is_in_memory(versions: list[Bundle], serving: Serving) -> None:
-    handlers, servings = _served(versions[0], max_bots=8)
+    _, servings = _served(versions[0], max_bots=8)
     small, large = serving.max_body_bytes, servings.named(None).max_body_bytes
-    assert all(small[form] < large[form] == handlers.max_body_bytes[form] for form in Format)
+    assert all(small[form] < large[form] == servings.max_body_bytes[form] for form in Format)
     servings.activate(serving)
-    assert handlers.max_body_bytes == small
+    assert servings.max_body_bytes == small
+    assert servings.max_hello_bytes == serving.max_hello_bytes
 
 
 def test_a_connection_without_bots_starts_the_next_ones_on_the_active_version(versions: list[Bundle]) -> None:

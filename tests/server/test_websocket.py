@@ -18,6 +18,7 @@ from websockets.http11 import Response
 from websockets.uri import WebSocketURI, parse_uri
 
 from protocol.client import BotClient
+from protocol.codec import Format, body_limit
 from protocol.transport import ReplyError
 from tests.protocol.golden import TABLE, VECTORS
 from tests.server.serving import Served, play, serve
@@ -156,6 +157,15 @@ def test_a_message_over_the_limit_is_refused_unread(served: Served, pieces: int)
         for _ in range(pieces - 1):
             raw.speaks.send_continuation(bytes(limit // pieces), fin=False)
         raw.speaks.send_continuation(bytes(pieces + 1), fin=True)
+        raw.flush()
+        assert raw.close_code() == 1009
+
+
+def test_before_hello_no_more_than_a_hello_is_read(served: Served) -> None:
+    longest = body_limit(TABLE, 0, Format.MSGPACK)
+    with _open(served) as raw:
+        assert raw.ask(b"\xc0" * longest)["code"] == "BAD_MSGPACK"
+        raw.speaks.send_binary(bytes(longest + 1))
         raw.flush()
         assert raw.close_code() == 1009
 
