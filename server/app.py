@@ -21,6 +21,7 @@ from protocol.transport import SOCKET_PATH
 from server.admin import AdminDoor, add_routes
 from server.catalogue import Catalogue
 from server.connections import Connections
+from server.crowd import Crowd
 from server.desk import Desk
 from server.due import Due
 from server.exchange import Exchange
@@ -78,14 +79,20 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             frame_deadline_s=settings.frame_deadline_s,
             idle_ttl_s=settings.idle_ttl_s,
         )
-        readiness, metrics = watch(settings, handlers, connections, worker, sockets)
+        crowd = Crowd(settings.http_sockets)
+        readiness, metrics = watch(settings, handlers, connections, worker, sockets, crowd)
         if settings.otlp_endpoint is not None:
             stack.callback(_telemetry(metrics, settings.otlp_endpoint, settings.otlp_every_s).close)
         rest = create_app(HttpDoor(handlers, worker), Probes(handlers, readiness, metrics))
         add_routes(rest, admin)
         application = Exchange(desk, rest, body_deadline_s=settings.frame_deadline_s)
         uvicorn_server, http_address = await stack.enter_async_context(
-            _http(settings, application, web_socket(sockets, settings.ws_origins))
+            _http(
+                settings,
+                application,
+                prompt_http(settings.frame_deadline_s, crowd, handlers.recorder),
+                web_socket(sockets, settings.ws_origins, crowd),
+            )
         )
         ws_address = http_address.replace("http://", "ws://") + SOCKET_PATH
         addresses = {
@@ -135,13 +142,13 @@ class _Uvicorn(uvicorn.Server):
 
 @asynccontextmanager
 async def _http(
-    settings: Settings, application: Exchange, socket_protocol: Any
+    settings: Settings, application: Exchange, protocol: Any, socket_protocol: Any
 ) -> AsyncIterator[tuple[uvicorn.Server, str]]:
     listening = _listen(settings.host, settings.port)
     server = _Uvicorn(
         uvicorn.Config(
             application,
-            http=prompt_http(settings.frame_deadline_s),
+            http=protocol,
             ws=socket_protocol,
             lifespan="off",
             log_config=None,

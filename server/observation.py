@@ -14,6 +14,7 @@ from prometheus_client.metrics_core import Metric
 
 from server import families
 from server.connections import Connections
+from server.crowd import Crowd
 from server.handlers import Handlers
 from server.metrics import Metrics
 from server.readiness import Readiness
@@ -32,7 +33,7 @@ class Observation(NamedTuple):
 
 
 def watch(
-    settings: Settings, handlers: Handlers, connections: Connections, worker: Worker, sockets: Sockets
+    settings: Settings, handlers: Handlers, connections: Connections, worker: Worker, sockets: Sockets, crowd: Crowd
 ) -> Observation:
     """What every server is asked about; whoever assembles it may register more."""
     readiness, metrics = Readiness(), Metrics()
@@ -43,7 +44,7 @@ def watch(
     metrics.register(lambda: families.bundles(handlers.servings))
     metrics.register(partial(_saturation, settings, connections, worker))
     metrics.register(partial(families.deadlines, sockets.desk.due))
-    metrics.register(lambda: families.sockets(sockets.by_transport()))
+    metrics.register(lambda: families.sockets(_by_transport(sockets, crowd)))
     metrics.register(lambda: families.readiness(readiness.names, readiness.failing()))
     return Observation(readiness, metrics)
 
@@ -62,12 +63,19 @@ def _stuck(busy_s: Callable[[], float], stuck_after_s: float) -> str | None:
     return None if since_s <= stuck_after_s else f"what runs now began {since_s:.1f} s ago and has not ended"
 
 
+def _by_transport(sockets: Sockets, crowd: Crowd) -> dict[str, int]:
+    """How many sockets are open; those of the HTTP port that are no WebSockets are `http`."""
+    counted = sockets.by_transport()
+    return {**counted, "http": len(crowd) - counted.get("ws", 0)}
+
+
 def _saturation(settings: Settings, connections: Connections, worker: Worker) -> Iterator[Metric]:
     """How full the server is, each number beside its limit."""
     for name, help_text, number in (
         ("bots_limit", "Bots that fit, of all bundles.", settings.max_bots),
         ("connections", "Connections.", len(connections)),
         ("connections_limit", "Connections that fit.", settings.max_connections),
+        ("http_sockets_limit", "Sockets that the HTTP port may have, WebSockets included.", settings.http_sockets),
         ("queue_length", "Requests that wait for the worker, with the one that it answers.", worker.n_waiting),
         ("queue_limit", "Requests that may wait.", worker.max_queue),
         (

@@ -1,4 +1,5 @@
-"""uvicorn's HTTP protocol with what it lacks: clients that dawdle over a request's head or do not take replies go.
+"""uvicorn's HTTP protocol with what it lacks: clients that are one too many, dawdle over a request's head or do not take
+replies go.
 
 This module knows nothing about what is served. uvicorn's own timer runs between requests alone: a socket that sends
 nothing after connecting, or its head a byte at a time, stays open for as long as its client likes.
@@ -12,6 +13,12 @@ from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
+from protocol.codec import Format
+from protocol.errors import TooManyConnections
+from server.answer import refusal
+from server.crowd import Crowd
+from server.recorder import Recorder
+
 __all__ = ["PromptHttp", "prompt_http"]
 
 _MAX_HEAD_BYTES = 65536
@@ -19,12 +26,14 @@ _MAX_HEAD_BYTES = 65536
 
 class PromptHttp(HttpToolsProtocol):
     """A socket of the HTTP door. `deadline_s` counts from connecting, from a head's first byte, and from a reply that
-    the client has no room for.
+    the client has no room for. One that the `crowd` has no place for is answered at once, whatever it would ask.
     """
 
-    def __init__(self, *args: Any, deadline_s: float, **named: Any) -> None:
+    def __init__(self, *args: Any, deadline_s: float, crowd: Crowd, recorder: Recorder, **named: Any) -> None:
         super().__init__(*args, **named)
         self._deadline_s = deadline_s
+        self._crowd, self._recorder = crowd, recorder
+        self._has_place = False
         self._head_timer: asyncio.TimerHandle | None = None
         self._reader_timer: asyncio.TimerHandle | None = None
         self._head_bytes = 0
@@ -34,12 +43,22 @@ class PromptHttp(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """See asyncio.Protocol."""
         super().connection_made(transport)
+        try:
+            self._crowd.enter()
+        except TooManyConnections as error:
+            self._recorder.refused("http", error.code)
+            transport.write(_turned_away(error))
+            transport.close()
+            return
+        self._has_place = True
         self._expect_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See asyncio.Protocol."""
         self._forget_answer()  # uvicorn tells the last of several pipelined requests only
         super().connection_lost(exc)
+        if self._has_place:
+            self._crowd.leave()
         _cancel(self._head_timer)
         self._head_timer = None
         _cancel(self._reader_timer)
@@ -47,6 +66,8 @@ class PromptHttp(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """See asyncio.Protocol."""
+        if not self._has_place:
+            return
         super().data_received(data)
         between = self.cycle is None or self.cycle.response_complete
         if between and not self._is_upgraded and self.timeout_keep_alive_task is None:
@@ -106,6 +127,13 @@ def _cancel(timer: asyncio.TimerHandle | None) -> None:
         timer.cancel()
 
 
-def prompt_http(deadline_s: float) -> Any:
+def _turned_away(error: TooManyConnections) -> bytes:
+    """In msgpack, as engines read it: what would have been asked for, and in which format, has not come yet."""
+    answered = refusal(error, Format.MSGPACK)
+    head = f"HTTP/1.1 503 Service Unavailable\r\nContent-Type: {Format.MSGPACK.value}\r\nRetry-After: 1\r\n"
+    return f"{head}Content-Length: {len(answered.body)}\r\nConnection: close\r\n\r\n".encode() + answered.body
+
+
+def prompt_http(deadline_s: float, crowd: Crowd, recorder: Recorder) -> Any:
     """The protocol as uvicorn's Config takes it."""
-    return partial(PromptHttp, deadline_s=deadline_s)
+    return partial(PromptHttp, deadline_s=deadline_s, crowd=crowd, recorder=recorder)

@@ -45,6 +45,9 @@ class Settings:
     """Bots at any time, over all connections."""
     max_connections: int = 64
     """Connections at any time, and open stream sockets."""
+    max_http_sockets: int | None = None
+    """Open sockets of the HTTP port, with those that became WebSockets; four times max-connections unless given. Those
+    beyond are closed at once."""
     max_queue: int = 64
     """Requests that wait for the inference thread; those beyond are refused with NOT_READY."""
     inline_us: float = 500.0
@@ -85,8 +88,8 @@ class Settings:
     def __post_init__(self) -> None:
         if (self.bundle is None) == (self.store is None):
             raise ValueError("give either a bundle or a store")
-        if min(self.max_bots, self.max_connections, self.max_queue, self.max_loaded) < 1:
-            raise ValueError("max_bots, max_connections, max_queue and max_loaded must be at least 1")
+        if min(self.max_bots, self.max_connections, self.max_queue, self.max_loaded, self.http_sockets) < 1:
+            raise ValueError("max_bots, max_connections, max_http_sockets, max_queue and max_loaded must be at least 1")
         if min(self.idle_ttl_s, self.frame_deadline_s, self.stuck_after_s, self.drain_s) <= 0:
             raise ValueError("idle_ttl_s, frame_deadline_s, stuck_after_s and drain_s must be positive")
         if self.otlp_endpoint is not None and not self.otlp_endpoint.startswith(("http://", "https://")):
@@ -109,6 +112,11 @@ class Settings:
                 f"refusing to listen on {self.host} without a token: anyone could take every bot. "
                 "Give --token-file, or --insecure-no-token if only trusted machines reach this network."
             )
+
+    @property
+    def http_sockets(self) -> int:
+        """How many sockets the HTTP port may have."""
+        return 4 * self.max_connections if self.max_http_sockets is None else self.max_http_sockets
 
     def tokens(self) -> tuple[str | None, str | None]:
         """The token of hellos and that of operators, None where there is none. Raises OSError, ValueError."""

@@ -25,6 +25,7 @@ from protocol.errors import ProtocolError, TooLarge, TooManyConnections
 from protocol.messages import Welcome
 from protocol.transport import SOCKET_PATH
 from server.conversation import Conversation
+from server.crowd import Crowd
 from server.sockets import Sockets
 
 __all__ = ["WebSocket", "web_socket"]
@@ -37,11 +38,12 @@ class WebSocket(Conversation):
     """One client's socket, given by the HTTP door with the bytes of its upgrade request.
 
     A browser says which page asks (Origin), so a page that is not one of `origins` takes no bots; other clients say
-    nothing. Pings are answered and put off no deadline.
+    nothing. Pings are answered and put off no deadline. It keeps the place in the `crowd` that it got from there.
     """
 
-    def __init__(self, sockets: Sockets, origins: Sequence[str]) -> None:
+    def __init__(self, sockets: Sockets, origins: Sequence[str], crowd: Crowd) -> None:
         super().__init__(sockets, "ws")
+        self._crowd = crowd
         self._protocol = ServerProtocol(
             origins=[None, *(cast("Origin", origin) for origin in origins)],
             max_size=sockets.desk.handlers.max_bytes(None, Format.MSGPACK),
@@ -55,6 +57,11 @@ class WebSocket(Conversation):
         """See asyncio.Protocol. The socket counts once its handshake has been accepted."""
         self._transport = cast("asyncio.Transport", transport)
         self._expect(self._sockets.frame_deadline_s)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        """See Conversation."""
+        super().connection_lost(error)
+        self._crowd.leave()
 
     def finish(self) -> None:
         """See Sockets."""
@@ -135,10 +142,10 @@ class WebSocket(Conversation):
                 self._end()
 
 
-def web_socket(sockets: Sockets, origins: Sequence[str]) -> Callable[..., WebSocket]:
+def web_socket(sockets: Sockets, origins: Sequence[str], crowd: Crowd) -> Callable[..., WebSocket]:
     """The protocol as uvicorn's Config takes it: what uvicorn says about itself is not needed."""
 
     def make(**_: object) -> WebSocket:
-        return WebSocket(sockets, origins)
+        return WebSocket(sockets, origins, crowd)
 
     return make

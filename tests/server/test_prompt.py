@@ -15,9 +15,12 @@ import uvicorn
 import uvloop
 from uvicorn.server import ServerState
 
+from server.crowd import Crowd
 from server.prompt import PromptHttp
+from server.recorder import Recorder
 from tests.server.serving import RawStream, Served, serve
 
+PATIENCE = {"deadline_s": 0.2, "crowd": Crowd(9), "recorder": Recorder()}
 REQUEST = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
 
 
@@ -120,7 +123,7 @@ def test_a_client_that_does_not_read_its_answers_is_closed(caplog: pytest.LogCap
 
         config = uvicorn.Config(large, log_config=None, lifespan="off", ws="none")
         state = ServerState()
-        protocol = partial(Watched, config=config, server_state=state, app_state={}, deadline_s=0.2)
+        protocol = partial(Watched, config=config, server_state=state, app_state={}, **PATIENCE)
         server = await asyncio.get_running_loop().create_server(protocol, "127.0.0.1", 0)
         with socket.create_connection(server.sockets[0].getsockname()) as deaf:
             deaf.sendall(REQUEST * 2)
