@@ -1,5 +1,4 @@
-"""uvicorn's HTTP protocol with what it lacks: clients that are one too many, dawdle over a request's head or do not take
-replies go.
+"""uvicorn's HTTP protocol with what it lacks: clients that are too many, dawdle over a head or take no replies go.
 
 This module knows nothing about what is served. uvicorn's own timer runs between requests alone: a socket that sends
 nothing after connecting, or its head a byte at a time, stays open for as long as its client likes.
