@@ -82,7 +82,8 @@ class Step:
         contexts = self._contexts
         has_last_N = contexts.turns(batch) > 0
         action_NA, reasons_N = held_actions(cause, contexts.last_action(batch), has_last_N, self._manifest.action.safe)
-        action_NA.flags.writeable = reasons_N.flags.writeable = False
+        action_NA.setflags(write=False)
+        reasons_N.setflags(write=False)
         return Actions(turn.frame, action_NA, reasons_N, 0.0, contexts.turns(batch).copy())
 
     def _infer(self, policy: Policy, turn: Turn, batch: Batch) -> float:
@@ -121,7 +122,8 @@ class Step:
         else:
             action_NA, reasons_N = self._fall_back(turn, batch, action_NA)
             self._counters.count(reasons_N)
-        action_NA.flags.writeable = reasons_N.flags.writeable = False
+        action_NA.setflags(write=False)
+        reasons_N.setflags(write=False)
         return Actions(turn.frame, action_NA, reasons_N, infer_us, self._contexts.turns(batch).copy())
 
     def _fall_back(

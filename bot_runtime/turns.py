@@ -44,7 +44,7 @@ class Queries(NamedTuple):
         """What was drawn, read-only."""
         reasons_N = None if drawn.asks_N is None else non_finite(drawn.asks_N)
         for array in (drawn.query_NM, drawn.cost_us_N, drawn.probs_NM):
-            array.flags.writeable = False
+            array.setflags(write=False)
         return cls(frame, drawn.query_NM, drawn.cost_us_N, drawn.probs_NM, drawn.infer_us, reasons_N)
 
     @classmethod

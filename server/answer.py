@@ -6,7 +6,9 @@ Every answered request passes here, with how and when it arrived. No exception l
 from __future__ import annotations
 
 import time
-from typing import NamedTuple, Self
+from typing import Self
+
+from msgspec import Struct
 
 from bot_runtime.deadline import Deadline
 from protocol import codec
@@ -22,7 +24,7 @@ __all__ = ["Answer", "Arrival", "answer", "refusal"]
 _log = logger(__name__)
 
 
-class Arrival(NamedTuple):
+class Arrival(Struct, frozen=True):  # made anew for every request: a tuple with names takes three times as long
     """By which transport a request came (`http`, `ws`, `tcp`, `unix`), when it was whole (ns of the monotonic clock)
     and by when it is to be answered, if that is said."""
 
@@ -36,7 +38,7 @@ class Arrival(NamedTuple):
         return cls(transport, time.monotonic_ns())
 
 
-class Answer(NamedTuple):
+class Answer(Struct, frozen=True):
     """A reply, the bytes to send, and the status where the door is HTTP."""
 
     reply: Reply

@@ -105,7 +105,7 @@ class Desk:
 
     def _due_by(self, arrival: Arrival, deadline_us: float | None) -> Arrival:
         deadline = self.due.of(deadline_us, arrival.received_ns)
-        return arrival if deadline is None else arrival._replace(deadline=deadline)
+        return arrival if deadline is None else Arrival(arrival.transport, arrival.received_ns, deadline)
 
     def _in_time(
         self, job: Callable[[], Answer], arrival: Arrival, work: tuple[type[object], int], form: Format

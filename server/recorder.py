@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_left
-from typing import NamedTuple
+
+from msgspec import Struct
 
 from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures, TakeTurn
 
@@ -25,7 +26,7 @@ WHOLE = len(PHASES)  # the histogram after those of the phases
 _TURNS, _TURN_REPLIES = (RequestQueries, SubmitFeatures, TakeTurn), (Queries, Actions)
 
 
-class Spans(NamedTuple):
+class Spans(Struct, frozen=True):
     """How long one request took, in ns: waiting for its turn, decoding, encoding, and from received to encoded."""
 
     wait_ns: int
@@ -56,7 +57,7 @@ class Histograms:
 
     def count_half_turn(self, spans: Spans, infer_us: float, n_bots: int) -> None:
         """Add one request in all its phases. Written out rather than looped over, which takes twice as long."""
-        wait_ns, decode_ns, encode_ns, whole_ns = spans
+        wait_ns, decode_ns, encode_ns, whole_ns = spans.wait_ns, spans.decode_ns, spans.encode_ns, spans.whole_ns
         infer_ns = int(infer_us * 1e3)
         waits, decodes, inferences, encodes, wholes = self.counts
         waits[bisect_left(NS_BOUNDS, wait_ns)] += 1
