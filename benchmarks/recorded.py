@@ -62,7 +62,7 @@ def in_process(bundle: Bundle, golden: Golden, n_bots: int, clock: Clock = "wall
     return _turns(RecordedFrames(bundle.manifest.features, golden, n_bots), ask, act, CLOCKS[clock])
 
 
-def over(client: BotClient, bundle: Bundle, golden: Golden, n_bots: int) -> Callable[[], Timed]:
+def over(client: BotClient, bundle: Bundle, golden: Golden, n_bots: int, clock: Clock = "wall") -> Callable[[], Timed]:
     """A call that plays the next turn of `n_bots` new bots of this client, in two round trips."""
     client.hello()
     handles = client.start(n_bots)
@@ -74,7 +74,7 @@ def over(client: BotClient, bundle: Bundle, golden: Golden, n_bots: int) -> Call
     def act(frame: int, query_NM: NDArray[np.bool_], costly_ND: NDArray[np.float32]) -> float:
         return client.act(handles, frame, query_NM, costly_ND).infer_us
 
-    return _turns(RecordedFrames(bundle.manifest.features, golden, n_bots), ask, act, CLOCKS["wall"])
+    return _turns(RecordedFrames(bundle.manifest.features, golden, n_bots), ask, act, CLOCKS[clock])
 
 
 def _turns(
