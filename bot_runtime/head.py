@@ -30,7 +30,8 @@ from bot_runtime.haste import Haste
 from bot_runtime.manifest import Manifest
 from bot_runtime.policy import Acquisition
 from bot_runtime.request import NOTHING_SAID, Numbers, Request
-from bot_runtime.spending import Limits, Spending
+from bot_runtime.spending import Spending
+from bot_runtime.start import Start
 from bot_runtime.turns import Queries
 from protocol.features import CostModel
 from protocol.messages import MAX_RETURN
@@ -62,15 +63,14 @@ class Head:
     ) -> None:
         """`acquisition` is a verified graph (`Bundle.load`). Raises BadBundle, BadShape, NonFinite, OutOfRange."""
         n_bots, table = len(seeds), manifest.features
-        model = cost_model or (costs.declared if costs else CostModel.declared(table))
-        inputs.check_costs(model, table)
-        returns_N = np.full(n_bots, manifest.target_return)
-        if target_returns is not None:
-            returns_N = inputs.per_bot("target_returns", target_returns, n_bots, -MAX_RETURN, MAX_RETURN)
+        said = Start.checked(
+            manifest, seeds, n_bots,
+            target_returns=target_returns, budgets_us=budgets_us, target_costs_us=target_costs_us,
+            cost_model=cost_model or (costs.declared if costs else None),
+        )  # fmt: skip
         slots_N = np.arange(n_bots, dtype=np.int64)
         self._contexts, self._spending = Contexts(manifest, n_bots), Spending(manifest, n_bots)
-        self._contexts.begin(slots_N, inputs.seeds(seeds, n_bots), returns_N)
-        self._spending.begin(slots_N, model, Limits.checked(n_bots, budgets_us, target_costs_us))
+        said.begin(slots_N, self._contexts, self._spending)
         means = Means.of(self._spending.terms(slots_N, NOTHING_SAID))
         self._company = Company(slots_N, self._contexts.batch(slots_N), means)
         self._checks = inputs.FeatureChecks(table, n_bots)
@@ -78,7 +78,7 @@ class Head:
             Acquisition(manifest, acquisition),
             Asking(table.n_queries, self._contexts, Haste(clock), clock),
         )
-        self._costs, self._left_N = costs, returns_N
+        self._costs, self._left_N = costs, said.returns_N
 
     def ask(
         self,

@@ -12,16 +12,16 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from bot_runtime.acquired import UNMEASURED
 from bot_runtime.company import Company
 from bot_runtime.draw import Draw
 from bot_runtime.fallback import Cause, Counters, non_finite
 from protocol.errors import FrameReused, NoPendingQuery
 from protocol.turn import Event, Phase, is_retry, transition
 
-__all__ = ["UNMEASURED", "Actions", "Queries", "Turn", "Turns"]
+__all__ = ["Actions", "Queries", "Turn", "Turns"]
 
 
-UNMEASURED = np.zeros(0)
 _NONE = 0  # the turn id of a bot that has had no turn
 _Ints = NDArray[np.int64]
 
@@ -89,6 +89,11 @@ class Turn:
     def phase(self) -> Phase:
         """Where its bots are, as long as it is their last turn."""
         return Phase.PENDING if self.actions is None else Phase.ANSWERED
+
+    def check_same(self, content: tuple[NDArray[Any], ...], kept: tuple[NDArray[Any], ...]) -> None:
+        """Raises FrameReused unless a retry's content is what was kept of this turn."""
+        if not all(np.array_equal(new, old) for new, old in zip(content, kept, strict=True)):
+            raise FrameReused(f"frame {self.frame} was sent before with other content")
 
 
 class Turns:
