@@ -208,20 +208,30 @@ def bots(bundle: Bundle) -> Bots:
 
 
 def test_budgets_are_kept_by_what_was_measured(bots: Bots) -> None:
+    """Every declaration is ten times too low, and each feature has a group of its own.
+
+    What was acquired in hardly any frame but the first has one measurement, which counted as twice what was expected
+    then, and stays priced by it until it is acquired again. So a frame may surprise by it, and by nothing else.
+    """
     engine, costs = Engine(bots), Costs(CostModel.declared(bots.bundle.manifest.features))
     handles = bots.start(3, seeds=[1, 2, 3], budgets_us=[1e6] * 3)
     shared_us, truth = 20.0, CostModel(0.0, tuple(10.0 * us for us in costs.declared.feature_us))
-    spent_us = []
+    spent_us, known = [], []
     for frame in range(300):
         queries = engine.ask(handles, frame, costs=costs, frame_budget_us=shared_us)
         assert queries.cost_us_N.sum() <= shared_us
         measured_us = float(truth.query_cost_us(queries.query_NM).sum())
         spent_us.append(measured_us)
+        n_acquired_M = np.array([row.n for row in sorted(costs.report().rows[1:], key=lambda row: row.declared_us)])
+        by_cost_M = n_acquired_M[np.argsort(np.argsort(costs.declared.costs_us))]
+        known.append(bool((by_cost_M[queries.query_NM.any(axis=0)] > 3).all()))
         bots.submit_features(
             handles, frame, queries.query_NM, engine.costly(frame, 3), acquire_us=measured_us, costs=costs
         )
     assert max(spent_us[:5]) > shared_us
-    assert sum(us > shared_us for us in spent_us[100:]) <= 2, "a feature that was hardly ever acquired may surprise"
+    later = list(zip(spent_us, known, strict=True))[100:]
+    assert max(us for us, known in later if known) <= shared_us
+    assert sum(not known for _, known in later) <= 5
     assert sum(spent_us[100:]) > 0.0
 
 
