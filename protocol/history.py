@@ -70,6 +70,22 @@ class History:
         self._log: list[Taken] = []
         self._prune_at = depth + _SLACK
 
+    def begin(
+        self,
+        numbers: Sequence[int],
+        seeds: Sequence[int],
+        default_return: float,
+        *,
+        target_returns: Sequence[float] | None,
+        budgets_us: Sequence[float] | None,
+        target_costs_us: Sequence[float] | None,
+    ) -> None:
+        """These bots have been started."""
+        limits = (target_returns, budgets_us, target_costs_us)
+        for row, number in enumerate(numbers):
+            left, budget_us, target_us = (None if said is None else float(said[row]) for said in limits)
+            self.bots[number] = Bot(seeds[row], default_return if left is None else left, budget_us, target_us)
+
     def ask(
         self, bots: Sequence[int], frame: int, free: ArrayLike, rewards: ArrayLike | None, limits: dict[str, Any]
     ) -> Asked:

@@ -12,15 +12,17 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from protocol.answered import Answered, Answers
 from protocol.client import BotClient
 from protocol.errors import NoBot, NoConnection
 from protocol.features import CostModel
-from protocol.history import Asked, Bot, History
+from protocol.history import History
+from protocol.names import Names
 from protocol.patience import Patience
 from protocol.replay import rebuild
 from protocol.replies import Actions, Queries, Welcome
@@ -28,17 +30,7 @@ from protocol.transport import ReplyError
 
 __all__ = ["ResumingClient"]
 
-_MAX_COMPANIES = 256  # bots that were named together, and whose last turn is remembered
 T = TypeVar("T")
-
-
-class _Turn(NamedTuple):
-    """The last turn of some bots, what was answered, and how often the client had resumed by then."""
-
-    asked: Asked
-    resumed: int
-    queries: Queries | None = None
-    actions: Actions | None = None
 
 
 class ResumingClient:
@@ -63,9 +55,8 @@ class ResumingClient:
         self._said: dict[str, Any] | None = None
         self._welcome: Welcome | None = None
         self._history = History(1)
-        self._handles: dict[int, int] = {}
-        self._turns: dict[tuple[int, ...], _Turn] = {}
-        self._next_bot = 0
+        self._names = Names()
+        self._turns = Answers()
         self.resumed = 0
 
     def __enter__(self) -> Self:
@@ -93,7 +84,7 @@ class ResumingClient:
         if self._welcome.replay_frames is None:
             raise ReplyError("this server cannot resume bots: it is older than this client")
         self._said, self._history = said, History(self._welcome.replay_frames)
-        self._handles, self._turns = {}, {}
+        self._names.now, self._turns = {}, Answers()
         return self._welcome
 
     def start(
@@ -116,13 +107,8 @@ class ResumingClient:
 
         handles_N = self._through(start, start, repeatable=False)
         self._welcome = self._client.welcome
-        default = self._welcome.target_return or 0.0
-        numbers = range(self._next_bot, self._next_bot + count)
-        self._next_bot += count
-        for row, number in enumerate(numbers):
-            left, budget_us, target_us = (None if said is None else float(said[row]) for said in limits.values())
-            self._history.bots[number] = Bot(drawn[row], default if left is None else left, budget_us, target_us)
-            self._handles[number] = int(handles_N[row])
+        numbers = self._names.add(handles_N)
+        self._history.begin(numbers, drawn, self._welcome.target_return or 0.0, **limits)
         return np.array(numbers, dtype=np.int64)
 
     def query(
@@ -137,19 +123,20 @@ class ResumingClient:
         deadline_us: float | None = None,
     ) -> Queries:
         """See BotClient."""
-        numbers, earlier = self._numbers(bots), self._before(bots, frame)
+        numbers = self._names.known(bots)
+        earlier = self._turns.before(numbers, frame, self.resumed)
         if earlier is not None and earlier.queries is not None:
             return earlier.queries
         limits = {"frame_budget_us": frame_budget_us, "budgets_us": budgets_us, "target_costs_us": target_costs_us}
         asked = self._history.ask(numbers, frame, free, rewards, limits)
 
         def ask() -> Queries:
-            now = self._now(numbers)
+            now = self._names.handles(numbers)
             return self._client.query(now, frame, free, rewards, deadline_us=deadline_us, **limits)  # type: ignore[arg-type]
 
         queries = self._through(ask, ask)
         self._history.count(asked)
-        self._remember(_Turn(asked, self.resumed, queries))
+        self._turns.keep(Answered(asked, self.resumed, queries))
         return queries
 
     def act(
@@ -164,14 +151,15 @@ class ResumingClient:
         deadline_us: float | None = None,
     ) -> Actions:
         """See BotClient. If the server that was asked is gone, the next one is told the whole turn, query and all."""
-        numbers, earlier = self._numbers(bots), self._before(bots, frame)
+        numbers = self._names.known(bots)
+        earlier = self._turns.before(numbers, frame, self.resumed)
         if earlier is not None and earlier.actions is not None:
             return earlier.actions
         said = {"acquired": acquired, "costly": costly, "failed": failed, "acquire_us": acquire_us}
-        turn = self._turns.get(tuple(numbers))
+        turn = self._turns.last(numbers)
 
         def act() -> Actions:
-            return self._client.act(self._now(numbers), frame, hidden=hidden, deadline_us=deadline_us, **said)  # type: ignore[arg-type]
+            return self._client.act(self._names.handles(numbers), frame, hidden=hidden, deadline_us=deadline_us, **said)  # type: ignore[arg-type]
 
         if turn is None or turn.asked.frame != frame:
             return self._through(act, act)  # which the server refuses
@@ -180,7 +168,7 @@ class ResumingClient:
         now_said["replayed_returns_to_go"] = asked.left_N
 
         def tell() -> Actions:
-            return self._client.take(self._now(numbers), frame, asked.free_NF, **now_said)
+            return self._client.take(self._names.handles(numbers), frame, asked.free_NF, **now_said)
 
         return self._answered(turn, said, self._through(act if earlier is None else tell, tell))
 
@@ -201,7 +189,8 @@ class ResumingClient:
         deadline_us: float | None = None,
     ) -> Actions:
         """See BotClient."""
-        numbers, earlier = self._numbers(bots), self._before(bots, frame)
+        numbers = self._names.known(bots)
+        earlier = self._turns.before(numbers, frame, self.resumed)
         if earlier is not None and earlier.actions is not None:
             return earlier.actions
         said = {"acquired": acquired, "costly": costly, "failed": failed, "acquire_us": acquire_us}
@@ -210,24 +199,23 @@ class ResumingClient:
         now_said = {**said, **limits, "rewards": rewards, "hidden": hidden, "deadline_us": deadline_us}
 
         def take() -> Actions:
-            return self._client.take(self._now(numbers), frame, free, **now_said)  # type: ignore[arg-type]
+            return self._client.take(self._names.handles(numbers), frame, free, **now_said)  # type: ignore[arg-type]
 
         actions = self._through(take, take)
         self._history.count(asked)
-        return self._answered(_Turn(asked, self.resumed), said, actions)
+        return self._answered(Answered(asked, self.resumed), said, actions)
 
     def stop(self, bots: ArrayLike) -> int:
         """See BotClient."""
-        numbers = self._numbers(bots)
+        numbers = self._names.known(bots)
 
         def stop() -> int:
-            return self._client.stop(self._now(numbers))
+            return self._client.stop(self._names.handles(numbers))
 
         stopped = self._through(stop, stop, repeatable=False)
         self._history.forget(numbers)
-        for number in numbers:
-            del self._handles[number]
-        self._turns = {named: turn for named, turn in self._turns.items() if not set(named) & set(numbers)}
+        self._names.forget(numbers)
+        self._turns.forget(numbers)
         return stopped
 
     def close(self) -> None:
@@ -235,32 +223,11 @@ class ResumingClient:
         self._said = None
         self._client.close()
 
-    def _before(self, bots: ArrayLike, frame: int) -> _Turn | None:
-        """The last turn of these bots if it is this frame's and from before the last time that they were resumed."""
-        turn = self._turns.get(tuple(self._numbers(bots)))
-        return turn if turn is not None and turn.asked.frame == frame and turn.resumed != self.resumed else None
-
-    def _answered(self, turn: _Turn, acquired: dict[str, Any], actions: Actions) -> Actions:
+    def _answered(self, turn: Answered, acquired: dict[str, Any], actions: Actions) -> Actions:
         if actions.turns is not None:
             self._history.take(turn.asked, acquired, actions.turns)
-        self._remember(turn._replace(resumed=self.resumed, actions=actions))
+        self._turns.keep(turn._replace(resumed=self.resumed, actions=actions))
         return actions
-
-    def _remember(self, turn: _Turn) -> None:
-        self._turns.pop(turn.asked.bots, None)
-        if len(self._turns) == _MAX_COMPANIES:
-            del self._turns[next(iter(self._turns))]
-        self._turns[turn.asked.bots] = turn
-
-    def _numbers(self, bots: ArrayLike) -> list[int]:
-        numbers: list[int] = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
-        for number in numbers:
-            if number not in self._handles:
-                raise NoBot(f"no bot {number} of this client")
-        return numbers
-
-    def _now(self, numbers: Sequence[int]) -> list[int]:
-        return [self._handles[number] for number in numbers]
 
     def _through(self, first: Callable[[], T], again: Callable[[], T], *, repeatable: bool = True) -> T:
         """The answer to `first`, or to `again` once the bots were resumed."""
@@ -278,6 +245,6 @@ class ResumingClient:
         welcome = self._client.hello(**said)
         if welcome.bundle_sha256 != was.bundle_sha256 or welcome.features != was.features:
             raise NoBot("another bundle is served now: the bots cannot be resumed")
-        self._handles = rebuild(self._client, self._history)
+        self._names.now = rebuild(self._client, self._history)
         self._welcome = self._client.welcome
         self.resumed += 1

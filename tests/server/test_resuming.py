@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from protocol.resuming import ResumingClient
 from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE, WELCOME
 from tests.server.mortal import Mortal, episode, plain, resuming
-from tests.server.serving import Served, costly_numbers, free_numbers, play, same
+from tests.server.serving import Served, costly_numbers, free_numbers, play, same, serve
 
 FRAMES = range(20)
 KINDS = {"context": {}, "memoryless": {"context_length": 1, "method": "rcbc"}, "conditioned": {"target_cost": 0.25}}
@@ -178,7 +179,7 @@ def test_another_bundle_cannot_go_on(tiny: Bundle, tmp_path: Path) -> None:
         client.query(bots, 1, free_numbers(TABLE, 1, 1))
 
 
-@pytest.mark.parametrize("door", ["http", "tcp", "unix"])
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_a_line_that_is_cut_is_no_death(served: Served, door: str) -> None:
     """Over HTTP the connection lives on and nothing is replayed; a stream's bots ended with it and are rebuilt."""
     with ResumingClient(served.addresses[door]) as client, ResumingClient(served.addresses[door]) as unbroken:
@@ -230,3 +231,33 @@ def test_a_server_that_is_too_busy_to_rebuild_is_asked_again(tiny: Bundle) -> No
     played += play(client, TABLE, bots, range(12, 16))
     assert same(played, play(unbroken, TABLE, own, range(16)))
     assert client.resumed == 1
+
+
+@pytest.fixture(scope="module")
+def impatient(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Its default deadline has always passed."""
+    with serve(bundle, tmp_path_factory.mktemp("socket") / "s", default_deadline_us=0.001) as running:
+        yield running
+
+
+@pytest.mark.parametrize("door", ["tcp", "ws"])
+def test_turns_of_before_have_no_deadline_where_the_server_has_a_default(impatient: Served, door: str) -> None:
+    """Some turns are given their time, some the default, which no query or no step has; a line is cut at each half."""
+
+    def run(client: ResumingClient, cut: Callable[[], None]) -> list[bytes]:
+        client.hello()
+        bots, played = client.start(2, seeds=[1, 2]), []
+        for frame in range(12):
+            free, costly = free_numbers(TABLE, 2, frame), costly_numbers(TABLE, 2, frame)
+            ask_us, act_us = (None if frame % 5 == 3 else 1e9), (None if frame % 5 == 4 else 1e9)
+            cut()
+            query = client.query(bots, frame, free, [0.25, 0.25], deadline_us=ask_us)
+            cut()
+            actions = client.act(bots, frame, query.queries, costly, hidden=True, deadline_us=act_us)
+            assert query.queries.any() or ask_us is None
+            played.append(query.queries.tobytes() + actions.actions.tobytes() + actions.turns.tobytes())
+        return played
+
+    with ResumingClient(impatient.addresses[door]) as client, ResumingClient(impatient.addresses[door]) as unbroken:
+        assert run(client, client._client._transport.close) == run(unbroken, lambda: None)
+        assert (client.resumed, unbroken.resumed) == (24, 0)

@@ -1,0 +1,52 @@
+"""Answered: the last turn of bots that were named together, and what a server said in it, for requests that repeat it.
+
+This module knows nothing about connections or contexts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from protocol.history import Asked
+from protocol.replies import Actions, Queries
+
+__all__ = ["Answered", "Answers"]
+
+_MAX_COMPANIES = 256
+
+
+class Answered(NamedTuple):
+    """One turn, what was answered so far, and how often the client had resumed by then."""
+
+    asked: Asked
+    resumed: int
+    queries: Queries | None = None
+    actions: Actions | None = None
+
+
+class Answers:
+    """The last turn of each of the companies, bots in one order, that were heard of last."""
+
+    def __init__(self) -> None:
+        self._turns: dict[tuple[int, ...], Answered] = {}
+
+    def last(self, bots: Sequence[int]) -> Answered | None:
+        """The last turn of exactly these bots, in this order."""
+        return self._turns.get(tuple(bots))
+
+    def before(self, bots: Sequence[int], frame: int, resumed: int) -> Answered | None:
+        """The same if it is this frame's, and from before the last time that they were resumed."""
+        turn = self.last(bots)
+        return turn if turn is not None and turn.asked.frame == frame and turn.resumed != resumed else None
+
+    def keep(self, turn: Answered) -> None:
+        """This is the last one of its bots; where there are too many, the oldest is forgotten."""
+        self._turns.pop(turn.asked.bots, None)
+        if len(self._turns) == _MAX_COMPANIES:
+            del self._turns[next(iter(self._turns))]
+        self._turns[turn.asked.bots] = turn
+
+    def forget(self, bots: Sequence[int]) -> None:
+        """Forget every turn that one of these was in."""
+        self._turns = {named: turn for named, turn in self._turns.items() if set(named).isdisjoint(bots)}
