@@ -7,6 +7,7 @@ package, plain dicts and numpy, on purpose not with `protocol.codec`. Shape lett
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -40,8 +41,9 @@ class BotClient:
     on; over TCP and Unix sockets the connection and its bots have ended, so say hello again.
     """
 
-    def __init__(self, url: str, *, timeout_s: float = 5.0) -> None:
-        self._transport = open_transport(url, timeout_s)
+    def __init__(self, url: str, *, timeout_s: float = 5.0, cafile: Path | None = None) -> None:
+        """`https`, `wss` and `tcps` speak TLS; `cafile` has the authorities to trust where not those of the system."""
+        self._transport = open_transport(url, timeout_s, cafile=cafile)
         self._packer = msgpack.Packer()  # kept, for each begins with a large buffer
         self._welcome: Welcome | None = None
 

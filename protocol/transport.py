@@ -1,4 +1,4 @@
-"""Ways to carry one request's bytes to a server and one reply's bytes back, all blocking: HTTP, TCP, Unix sockets.
+"""Ways to carry one request's bytes to a server and one reply's bytes back, all blocking: HTTP, TCP, Unix sockets, TLS.
 
 This module knows nothing about what the bytes say. A transport opens its socket when it is first needed, and closes it
 after any failure: a late answer must never be read as the answer to the next request.
@@ -7,11 +7,22 @@ after any failure: a late answer must never be read as the answer to the next re
 from __future__ import annotations
 
 import socket
+import ssl
 import struct
+from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
-__all__ = ["MAX_REPLY_BYTES", "ROUTES", "HttpTransport", "ReplyError", "StreamTransport", "Transport", "open_transport"]
+__all__ = [
+    "MAX_REPLY_BYTES",
+    "ROUTES",
+    "HttpTransport",
+    "ReplyError",
+    "StreamTransport",
+    "Transport",
+    "connected",
+    "open_transport",
+]
 
 MAX_REPLY_BYTES = 64 * 2**20
 CONNECTION_HEADER = "X-Bot-Connection"
@@ -25,6 +36,7 @@ ROUTES = {
     "goodbye": "/v1/connections/close",
 }
 SOCKET_PATH = "/v1/socket"
+_DOORS = {"http": "http", "https": "http", "ws": "ws", "wss": "ws", "tcp": "tcp", "tcps": "tcp"}
 _REPEATABLE = {
     "request_queries",
     "submit_features",
@@ -49,29 +61,36 @@ class Transport(Protocol):
         """Close the socket, if one is open. A later exchange opens a new one."""
 
 
-def open_transport(url: str, timeout_s: float) -> Transport:
+def open_transport(url: str, timeout_s: float, *, cafile: Path | None = None) -> Transport:
     """The transport for `http://host:port`, `ws://host:port`, `tcp://host:port` or `unix:///path`.
 
-    Raises ValueError for other URLs, ImportError where WebSockets need a package that is not installed.
+    `https`, `wss` and `tcps` are the same over TLS, to a server whose certificate is for `host` and signed by one of
+    the system's authorities, or by one in `cafile` (PEM) instead. Raises ValueError for other URLs, OSError for a
+    `cafile` that holds none, ImportError where WebSockets need a package that is not installed.
     """
     parts = urlsplit(url)
     if parts.scheme == "unix" and parts.path and not parts.netloc:
         return StreamTransport(parts.path, timeout_s)
-    if parts.scheme == "ws" and parts.hostname and parts.port and parts.path in ("", "/", SOCKET_PATH):
-        return _web_socket(parts.hostname, parts.port, timeout_s)
-    if parts.scheme in ("http", "tcp") and parts.hostname and parts.port and parts.path in ("", "/"):
-        if parts.scheme == "http":
-            return HttpTransport(parts.hostname, parts.port, timeout_s)
-        return StreamTransport((parts.hostname, parts.port), timeout_s)
-    raise ValueError(f"{url!r} is none of http://host:port, ws://host:port, tcp://host:port, unix:///path")
+    door = _DOORS.get(parts.scheme)
+    if door is not None and parts.hostname and parts.port:
+        tls = None if parts.scheme == door else ssl.create_default_context(cafile=cafile)
+        if door == "ws" and parts.path in ("", "/", SOCKET_PATH):
+            return _web_socket(parts.hostname, parts.port, timeout_s, tls)
+        if door == "http" and parts.path in ("", "/"):
+            return HttpTransport(parts.hostname, parts.port, timeout_s, tls)
+        if door == "tcp" and parts.path in ("", "/"):
+            return StreamTransport((parts.hostname, parts.port), timeout_s, tls)
+    raise ValueError(
+        f"{url!r} is none of http://host:port, ws://host:port, tcp://host:port, unix:///path, or https, wss, tcps"
+    )
 
 
-def _web_socket(host: str, port: int, timeout_s: float) -> Transport:
+def _web_socket(host: str, port: int, timeout_s: float, tls: ssl.SSLContext | None) -> Transport:
     try:
         from protocol.websocket import WebSocketTransport
     except ImportError as error:  # the only transport that needs a package
         raise ImportError("ws:// needs the package `websockets`: install the extra `server`, or it alone") from error
-    return WebSocketTransport(host, port, SOCKET_PATH, timeout_s)
+    return WebSocketTransport(host, port, SOCKET_PATH, timeout_s, tls)
 
 
 class HttpTransport:
@@ -80,9 +99,10 @@ class HttpTransport:
     It speaks as much HTTP as the server does: replies with a `Content-Length`. `http.client` takes twice as long.
     """
 
-    def __init__(self, host: str, port: int, timeout_s: float) -> None:
+    def __init__(self, host: str, port: int, timeout_s: float, tls: ssl.SSLContext | None = None) -> None:
         self._address = host, port
         self._timeout_s = timeout_s
+        self._tls = tls
         name = f"[{host}]" if ":" in host else host
         rest = f" HTTP/1.1\r\nHost: {name}:{port}\r\nContent-Type: {_CONTENT_TYPE}\r\nContent-Length: "
         self._heads = {kind: f"POST {path}{rest}".encode("ascii") for kind, path in ROUTES.items()}
@@ -93,7 +113,7 @@ class HttpTransport:
         reused = self._socket is not None
         try:
             return self._exchange(kind, body, connection)
-        except ConnectionError:
+        except (ConnectionError, ssl.SSLEOFError, ssl.SSLZeroReturnError):  # what a closed socket says under TLS
             if not (reused and kind in _REPEATABLE):
                 raise
         return self._exchange(kind, body, connection)
@@ -108,7 +128,7 @@ class HttpTransport:
         named = b"" if connection is None else f"\r\n{CONNECTION_HEADER}: {connection}".encode("ascii")
         try:
             if self._socket is None:
-                self._socket = _connected(self._address, self._timeout_s)
+                self._socket = connected(self._address, self._timeout_s, self._tls)
             self._socket.sendall(b"%b%d%b\r\n\r\n%b" % (self._heads[kind], len(body), named, body))
             reply, is_kept = _read_http(self._socket)
         except OSError:
@@ -122,9 +142,10 @@ class HttpTransport:
 class StreamTransport:
     """Frames of a 4-byte big-endian length and that many bytes, over TCP `(host, port)` or a Unix socket's path."""
 
-    def __init__(self, address: tuple[str, int] | str, timeout_s: float) -> None:
+    def __init__(self, address: tuple[str, int] | str, timeout_s: float, tls: ssl.SSLContext | None = None) -> None:
         self._address = address
         self._timeout_s = timeout_s
+        self._tls = tls
         self._socket: socket.socket | None = None
 
     def exchange(self, kind: str, body: bytes, connection: str | None) -> bytes:
@@ -146,7 +167,7 @@ class StreamTransport:
 
     def _connect(self) -> socket.socket:
         if isinstance(self._address, tuple):
-            return _connected(self._address, self._timeout_s)
+            return connected(self._address, self._timeout_s, self._tls)
         unconnected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             unconnected.settimeout(self._timeout_s)
@@ -157,10 +178,15 @@ class StreamTransport:
         return unconnected
 
 
-def _connected(address: tuple[str, int], timeout_s: float) -> socket.socket:
-    connected = socket.create_connection(address, timeout=timeout_s)
-    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    return connected
+def connected(address: tuple[str, int], timeout_s: float, tls: ssl.SSLContext | None = None) -> socket.socket:
+    """A socket to this host and port, over TLS where there is a context of it. Raises OSError (SSLError)."""
+    opened = socket.create_connection(address, timeout=timeout_s)
+    try:
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return opened if tls is None else tls.wrap_socket(opened, server_hostname=address[0])
+    except OSError:
+        opened.close()
+        raise
 
 
 def _read_http(source: socket.socket) -> tuple[bytes, bool]:

@@ -6,6 +6,7 @@ This module knows nothing about what the bytes say. It needs the package `websoc
 from __future__ import annotations
 
 import socket
+import ssl
 from collections import deque
 
 from websockets.client import ClientProtocol
@@ -14,7 +15,7 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.uri import WebSocketURI
 
-from protocol.transport import MAX_REPLY_BYTES, ReplyError
+from protocol.transport import MAX_REPLY_BYTES, ReplyError, connected
 
 __all__ = ["WebSocketTransport"]
 
@@ -22,10 +23,11 @@ _READ_BYTES = 65536
 
 
 class WebSocketTransport:
-    """One WebSocket at `ws://host:port/path`, which is the connection; no compression, no subprotocol."""
+    """One WebSocket at `ws://host:port/path`, or `wss`, which is the connection; no compression, no subprotocol."""
 
-    def __init__(self, host: str, port: int, path: str, timeout_s: float) -> None:
-        self._uri = WebSocketURI(False, host, port, path, "")
+    def __init__(self, host: str, port: int, path: str, timeout_s: float, tls: ssl.SSLContext | None = None) -> None:
+        self._uri = WebSocketURI(tls is not None, host, port, path, "")
+        self._tls = tls
         self._timeout_s = timeout_s
         self._socket: socket.socket | None = None
 
@@ -54,8 +56,7 @@ class WebSocketTransport:
         self._protocol = ClientProtocol(self._uri, max_size=MAX_REPLY_BYTES)
         self._messages: deque[bytes] = deque()
         self._fragments: list[bytes] = []
-        self._socket = opened = socket.create_connection((self._uri.host, self._uri.port), timeout=self._timeout_s)
-        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = opened = connected((self._uri.host, self._uri.port), self._timeout_s, self._tls)
         self._protocol.send_request(self._protocol.connect())
         self._flush(opened)
         while self._protocol.state is State.CONNECTING:
