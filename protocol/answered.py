@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from protocol.history import Asked
 from protocol.replies import Actions, Queries
 
@@ -23,6 +25,12 @@ class Answered(NamedTuple):
     resumed: int
     queries: Queries | None = None
     actions: Actions | None = None
+
+    def told(self, actions: Actions) -> Actions:
+        """The answer to a whole turn, as to the features of its query: what was never asked for still says why."""
+        if self.queries is None:
+            return actions
+        return actions._replace(reasons=np.where(actions.reasons == 0, self.queries.reasons, actions.reasons))
 
 
 class Answers:

@@ -168,7 +168,7 @@ class ResumingClient:
         now_said["replayed_returns_to_go"] = asked.left_N
 
         def tell() -> Actions:
-            return self._client.take(self._names.handles(numbers), frame, asked.free_NF, **now_said)
+            return turn.told(self._client.take(self._names.handles(numbers), frame, asked.free_NF, **now_said))
 
         return self._answered(turn, said, self._through(act if earlier is None else tell, tell))
 

@@ -255,7 +255,8 @@ def test_turns_of_before_have_no_deadline_where_the_server_has_a_default(impatie
             cut()
             actions = client.act(bots, frame, query.queries, costly, hidden=True, deadline_us=act_us)
             assert query.queries.any() or ask_us is None
-            played.append(query.queries.tobytes() + actions.actions.tobytes() + actions.turns.tobytes())
+            said = (query.queries, query.reasons, actions.actions, actions.reasons, actions.turns)
+            played.append(b"".join(array.tobytes() for array in said))
         return played
 
     with ResumingClient(impatient.addresses[door]) as client, ResumingClient(impatient.addresses[door]) as unbroken:
