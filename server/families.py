@@ -94,6 +94,8 @@ def bundles(servings: Iterable[Serving]) -> Iterator[Metric]:
     skipped, abandoned = summed("skipped_frames", "counters"), summed("abandoned_queries", "counters")
     yield _counter("skipped_frames", "Frame numbers that a bot never saw.", _BUNDLE, skipped)
     yield _counter("abandoned_queries", "Pending queries that a newer frame replaced.", _BUNDLE, abandoned)
+    opened = {key: sum(each.bots.haste.breaker.n_opened for each in group) for key, group in by_bundle.items()}
+    yield _counter("breaker_opened", "Times that a bundle was too slow too often.", _BUNDLE, opened)
     for number, (name, help_text) in _SPENT_US.items():
         in_s = {key: us / 1e6 for key, us in summed(number, "spent").items()}
         yield _counter(f"{name}_seconds", help_text, _BUNDLE, in_s)

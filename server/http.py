@@ -50,6 +50,13 @@ class HttpDoor:
             return _refused(error, Format.JSON)
         return Response(summary(serving.manifest), media_type=Format.JSON.value)
 
+    async def not_served(self, request: Request, error: Exception) -> Response:
+        """Count what nothing is served for, and say so."""
+        status = error.status_code if isinstance(error, HTTPException) else 500
+        refused = _BY_STATUS.get(status, InternalError)(f"{request.method} {request.url.path[:200]} is not served")
+        self._handlers.recorder.refused("http", refused.code)
+        return _refused(refused, _accepted(request))
+
     async def costs(self, request: Request) -> Response:
         """What acquiring costs each connected engine, as declared and as measured; needs the token as `bundle` does."""
         try:
@@ -67,16 +74,10 @@ def create_app(door: HttpDoor, probes: Probes) -> FastAPI:
     views |= {"/healthz": probes.healthz, "/readyz": probes.readyz, "/metrics": probes.metrics}
     for path, view in views.items():
         app.add_api_route(path, view, methods=["GET"], response_class=Response)
-    app.add_exception_handler(HTTPException, _http_refusal)
+    app.add_exception_handler(HTTPException, door.not_served)
     app.add_exception_handler(Exception, _internal)
     document(app)
     return app
-
-
-async def _http_refusal(request: Request, error: Exception) -> Response:
-    status = error.status_code if isinstance(error, HTTPException) else 500
-    refused = _BY_STATUS.get(status, InternalError)(f"{request.method} {request.url.path[:200]} is not served")
-    return _refused(refused, _accepted(request))
 
 
 async def _internal(request: Request, error: Exception) -> Response:

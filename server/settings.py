@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from protocol.messages import MAX_DEADLINE_US
-from server.tokens import read_token
+from server.tokens import MIN_CHARS, read_token
 
 __all__ = ["Settings"]
 
@@ -64,7 +64,8 @@ class Settings:
     drain_s: float = 5.0
     """After SIGTERM, requests in progress have this long to finish."""
     token: str | None = None
-    """What Hello must carry. Required unless the host is a loopback address. Who lists processes can read it here."""
+    """What Hello must carry. Required unless the host is a loopback address, and then of at least 16 characters. Who
+    lists processes can read it here."""
     token_file: Path | None = None
     """File of one line with that token, instead."""
     admin_token_file: Path | None = None
@@ -106,6 +107,8 @@ class Settings:
             raise ValueError("the token must not be empty")
         if self.token is not None and self.token_file is not None:
             raise ValueError("give the token or its file, not both")
+        if self.token is not None and len(self.token) < MIN_CHARS and not _is_loopback(self.host):
+            raise ValueError(f"the token has {len(self.token)} characters, expected at least {MIN_CHARS}")
         has_token = self.token is not None or self.token_file is not None
         if not has_token and not self.insecure_no_token and not _is_loopback(self.host):
             raise ValueError(

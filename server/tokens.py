@@ -10,9 +10,9 @@ from pathlib import Path
 
 from protocol.errors import Unauthorized
 
-__all__ = ["bearer", "check", "read_token"]
+__all__ = ["MIN_CHARS", "bearer", "check", "read_token"]
 
-_MIN_CHARS, _MAX_CHARS = 16, 1024  # so few that are random cannot be guessed at any rate
+MIN_CHARS, _MAX_CHARS = 16, 1024  # so few that are random cannot be guessed at any rate
 
 
 def read_token(path: Path) -> str:
@@ -20,8 +20,8 @@ def read_token(path: Path) -> str:
     with path.open(encoding="utf-8") as file:
         content = file.read(_MAX_CHARS + 2)
     token = content.removesuffix("\n").removesuffix("\r")
-    if not _MIN_CHARS <= len(token) <= _MAX_CHARS or not token.isprintable():
-        expected = f"expected one line of {_MIN_CHARS} to {_MAX_CHARS} printable characters"
+    if not MIN_CHARS <= len(token) <= _MAX_CHARS or not token.isprintable():
+        expected = f"expected one line of {MIN_CHARS} to {_MAX_CHARS} printable characters"
         raise ValueError(f"{path} holds no token: {expected}")
     return token
 

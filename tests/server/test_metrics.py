@@ -68,6 +68,7 @@ def test_what_happened_is_what_it_says(server: Served, door: str) -> None:
         assert scrape("actions_total", reason="non_finite_step_safe_action") == 0
         assert scrape("queries_total", reason="learned") == 6 * N
         assert scrape("deadlines_missed_total", outcome="late") == 0
+        assert scrape("breaker_opened_total", bundle="tiny") == 0
         assert scrape("refused_total", transport=door, code="NO_BOT") == 1
         assert scrape("skipped_frames_total") == N * (3 + 1)
         assert scrape("abandoned_queries_total") == N
@@ -139,6 +140,10 @@ def test_what_a_door_refuses_is_counted_too(bundle: Path, tmp_path: Path) -> Non
         http = server.addresses["http"]
         assert http_request(http, "POST", "/v1/query", b"x", {"Content-Type": "text/plain"}).status == 415
         assert http_request(http, "GET", "/v1/costs").status == 401
+        assert http_request(http, "GET", "/v1/nothing").status == 404
+        assert http_request(http, "DELETE", "/healthz").status == 405
+        operator = http_request(http, "POST", "/v1/bundles/tiny/activate", b"{}", {"Content-Type": "application/json"})
+        assert operator.status == 401
         assert http_request(http, "POST", "/v1/connections", b"{", {"Content-Type": "application/json"}).status == 400
         scrape = Scrape(server, Authorization="Bearer s3cret")
     refused = {(s.labels["transport"], s.labels["code"]): s.value for s in scrape.samples if "refused" in s.name}
@@ -146,7 +151,9 @@ def test_what_a_door_refuses_is_counted_too(bundle: Path, tmp_path: Path) -> Non
         ("unix", "TOO_MANY_CONNECTIONS"): 1,
         ("tcp", "TOO_LARGE"): 1,
         ("http", "UNSUPPORTED_MEDIA_TYPE"): 1,
-        ("http", "UNAUTHORIZED"): 1,
+        ("http", "UNAUTHORIZED"): 2,
+        ("http", "NO_ROUTE"): 1,
+        ("http", "METHOD_NOT_ALLOWED"): 1,
         ("http", "BAD_JSON"): 1,
     }
 

@@ -16,7 +16,9 @@ def test_loopback_needs_no_token(host: str) -> None:
 def test_any_other_address_needs_a_token_or_an_explicit_word(host: str) -> None:
     with pytest.raises(ValueError, match="token"):
         Settings(bundle=Path("b"), host=host)
-    assert Settings(bundle=Path("b"), host=host, token="t").host == host
+    assert Settings(bundle=Path("b"), host=host, token="t" * 16).host == host
+    with pytest.raises(ValueError, match="at least 16"):
+        Settings(bundle=Path("b"), host=host, token="t" * 15)
     assert Settings(bundle=Path("b"), host=host, insecure_no_token=True).host == host
 
 
