@@ -85,7 +85,7 @@ class Connections:
         """The connection of this name, which is thereby heard from; raises NoConnection, also if it is overdue."""
         connection = self.peek(connection_id)
         now_s = self._clock()
-        if connection is None or now_s - connection.last_seen_s > self._idle_ttl_s:
+        if connection is None or self._is_silent(connection, now_s):
             raise NoConnection("say hello first" if connection_id is None else "no such connection: say hello again")
         connection.last_seen_s = now_s
         return connection
@@ -101,7 +101,10 @@ class Connections:
     def remove_silent(self) -> list[Connection]:
         """Forget every connection that has been silent for longer than the TTL, and return them."""
         now_s = self._clock()
-        silent = [each for each in self._by_id.values() if now_s - each.last_seen_s > self._idle_ttl_s]
+        silent = [each for each in self._by_id.values() if self._is_silent(each, now_s)]
         for connection in silent:
             del self._by_id[connection.id]
         return silent
+
+    def _is_silent(self, connection: Connection, now_s: float) -> bool:
+        return now_s - connection.last_seen_s > self._idle_ttl_s
