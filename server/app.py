@@ -85,7 +85,7 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             stack.callback(_telemetry(metrics, settings.otlp_endpoint, settings.otlp_every_s).close)
         rest = create_app(HttpDoor(handlers, worker), Probes(handlers, readiness, metrics))
         add_routes(rest, admin)
-        application = Exchange(desk, rest, body_deadline_s=settings.frame_deadline_s)
+        application = Exchange(desk, rest, sockets.brake, body_deadline_s=settings.frame_deadline_s)
         uvicorn_server, http_address = await stack.enter_async_context(
             _http(
                 settings,

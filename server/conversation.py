@@ -11,7 +11,7 @@ from abc import abstractmethod
 from typing import cast
 
 from protocol.codec import Format
-from protocol.errors import TooManyConnections
+from protocol.errors import TooManyConnections, Unauthorized
 from protocol.messages import Farewell, Welcome
 from server.answer import Answer, Arrival, refusal
 from server.sockets import Sockets
@@ -130,6 +130,12 @@ class Conversation(asyncio.Protocol):
             answered.add_done_callback(lambda future: self._reply(future.result()))
 
     def _reply(self, answered: Answer) -> None:
+        if answered.status == Unauthorized.status:
+            self._loop.call_later(self._sockets.brake.wait_s(), self._send, answered)
+        else:
+            self._send(answered)
+
+    def _send(self, answered: Answer) -> None:
         self.is_busy = False
         if isinstance(answered.reply, Welcome):
             self._connection = answered.reply.connection

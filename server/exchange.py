@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+from functools import partial
 
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from protocol import messages
 from protocol.codec import Format
@@ -20,9 +21,11 @@ from protocol.errors import (
     NoConnection,
     ProtocolError,
     TooLarge,
+    Unauthorized,
     UnsupportedMediaType,
 )
 from server.answer import Answer, Arrival, refusal
+from server.brake import Brake
 from server.desk import Desk
 from server.openapi import CONNECTION_HEADER, ROUTES
 
@@ -38,8 +41,9 @@ _Headers = dict[bytes, bytes]
 class Exchange:
     """Answers POST requests to the messages' paths at this desk; passes all others on to `rest`."""
 
-    def __init__(self, desk: Desk, rest: ASGIApp, *, body_deadline_s: float) -> None:
+    def __init__(self, desk: Desk, rest: ASGIApp, brake: Brake, *, body_deadline_s: float) -> None:
         self._desk = desk
+        self._brake = brake
         self._rest = rest
         self._body_deadline_s = body_deadline_s
         self._kinds = {path: kind for path, (kind, _) in ROUTES.items()}
@@ -48,7 +52,7 @@ class Exchange:
         """See ASGI."""
         kind = self._kinds.get(scope["path"]) if scope["type"] == "http" else None
         if kind is None:
-            await self._rest(scope, receive, send)
+            await self._rest(scope, receive, partial(self._send_braked, send))
             return
         headers: _Headers = {}
         for name, value in scope["headers"]:
@@ -76,7 +80,13 @@ class Exchange:
             answered = refusal(error, reply_form)
             # Part of the body may still be on its way.
             may_go_on = not isinstance(error, TooLarge | NoConnection | BadMsgpack | BadJson)
-        await _send(send, answered, reply_form, may_go_on)
+        sending = send if answered.status == 200 else partial(self._send_braked, send)
+        await _send(sending, answered, reply_form, may_go_on)
+
+    async def _send_braked(self, send: Send, message: Message) -> None:
+        if message["type"] == "http.response.start" and message["status"] == Unauthorized.status:
+            await asyncio.sleep(self._brake.wait_s())
+        await send(message)
 
     async def _body(self, headers: _Headers, receive: Receive, form: Format, connection: str | None) -> bytes | None:
         """The whole body; None where the client has left. One too long of a connection that has ended: NoConnection."""

@@ -10,6 +10,7 @@ from collections import Counter
 from typing import Protocol
 
 from protocol.errors import TooManyConnections
+from server.brake import Brake
 from server.desk import Desk
 
 __all__ = ["Sockets"]
@@ -35,7 +36,7 @@ class Sockets:
     """At most `max_sockets` at a time, all asking at one desk.
 
     A socket closes when its client does, after `idle_ttl_s` of silence between requests, and after `frame_deadline_s`
-    of a request that does not end, a reply that is not taken, or a hello that does not come.
+    of a request that does not end, a reply that is not taken, or a hello that does not come. `brake` is every door's.
     """
 
     def __init__(self, desk: Desk, *, max_sockets: int, frame_deadline_s: float, idle_ttl_s: float) -> None:
@@ -43,6 +44,7 @@ class Sockets:
         self.frame_deadline_s = frame_deadline_s
         self.idle_ttl_s = idle_ttl_s
         self.draining = False
+        self.brake = Brake()
         self._max_sockets = max_sockets
         self._open: set[_Open] = set()
         self._emptied = asyncio.Event()
