@@ -61,7 +61,8 @@ class Proxy:
 
     async def _main(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        server = await asyncio.start_server(self._serve, "127.0.0.1", 0, ssl=self._context)
+        # A client that is between two requests does not read, so it does not say goodbye: half a minute, by default.
+        server = await asyncio.start_server(self._serve, "127.0.0.1", 0, ssl=self._context, ssl_shutdown_timeout=0.1)
         self.port = server.sockets[0].getsockname()[1]
         self._started.set()
         await self._stop.wait()
