@@ -7,6 +7,7 @@ here communicates. This module knows nothing about policies or traces. Shape let
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -32,6 +33,9 @@ def joined(device: str) -> Iterator[None]:
             rich.reconfigure(quiet=True)
         yield
     finally:
+        # Modules that were spread lie in reference cycles and hold the group: what of it is left when the interpreter
+        # ends takes the process down, for its threads were never joined.
+        gc.collect()
         distributed.destroy_process_group()
 
 
