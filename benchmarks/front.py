@@ -17,12 +17,13 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import urlsplit
 
+from game.launcher import end
+
 __all__ = ["CONFIG", "Front", "FrontFailed", "configured"]
 
 CONFIG = Path(__file__).parent.parent / "docker" / "haproxy" / "haproxy.cfg"
 _HOST = "127.0.0.1"
 _START_S = 60.0
-_STOP_S = 5.0
 _PATIENT = "    timeout connect 60s\n    timeout check 60s"  # a process that is slow is not dead: that one refuses
 _POLL_S = 0.02
 
@@ -67,12 +68,7 @@ class Front:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(_STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end(self._process)
         self._folder.cleanup()
 
     def _wait_for(self, port: int) -> None:

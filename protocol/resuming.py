@@ -11,6 +11,7 @@ import secrets
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -46,11 +47,12 @@ class ResumingClient:
         url: str,
         *,
         timeout_s: float = 5.0,
+        cafile: Path | None = None,
         limit_s: float = 30.0,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
-        self._client = BotClient(url, timeout_s=timeout_s)
+        self._client = BotClient(url, timeout_s=timeout_s, cafile=cafile)
         self._patience = Patience(limit_s, clock, sleep)
         self._said: dict[str, Any] | None = None
         self._welcome: Welcome | None = None

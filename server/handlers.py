@@ -1,7 +1,8 @@
 """What each message does: the one place where messages meet bots, for every transport.
 
-This module knows nothing about sockets, HTTP or bytes. It runs on the worker's thread alone. Everything is checked
-before any bot is touched, so a refused request leaves every bot as it was.
+This module knows nothing about sockets, HTTP or bytes. It runs on one thread at a time: the worker's, or the event
+loop's while the worker is idle (`server.desk`). Everything is checked before any bot is touched, so a refused request
+leaves every bot as it was.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
 from protocol.client import BotClient
+from protocol.resuming import ResumingClient
 from tests.bundles import make_bundle
 from tests.server.serving import Served, free_numbers, play, same, serve
 
@@ -162,6 +163,18 @@ def test_a_query_is_sent_again_where_the_socket_had_closed(served: Served, own: 
         for frame in range(3):
             proxy.drop()
             assert client.query(bots, frame, free_numbers(table, 1, frame), np.zeros(1)).frame == frame
+
+
+def test_bots_are_resumed_over_tls(served: Served, own: tuple[Path, Path]) -> None:
+    with (
+        before(served, "tcp", own) as proxy,
+        ResumingClient(f"tcps://127.0.0.1:{proxy.port}", cafile=own[0]) as client,
+    ):
+        table, bots = client.hello().features, client.start(1)
+        for frame in range(2):
+            proxy.drop()
+            assert client.query(bots, frame, free_numbers(table, 1, frame), np.zeros(1)).frame == frame
+        assert client.resumed == 2
 
 
 def test_what_names_no_door_is_refused() -> None:
