@@ -35,6 +35,7 @@ __all__ = ["Outcome", "SweepConfig", "main", "sweep"]
 _PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "minari", "gymnasium")
 _POLL_S = 1.0
 _STOP_S = 30.0  # for Ray's tasks to end the processes that they started
+_FILE_COLUMNS = 160  # of what is not written to a terminal: one line a run, to be searched
 _STORE_BYTES = 100 * 2**20  # of a Ray started here: tasks send nothing but their names
 
 Submit = Callable[[Run], "Future[str]"]  # the future is why the run failed, or nothing
@@ -221,8 +222,10 @@ def _write_about(config: SweepConfig, out: Path, names: list[str]) -> None:
 
 def _table(outcomes: list[Outcome]) -> Table:
     table = Table(box=None)
-    table.add_column("run", no_wrap=True)
-    for name in ("state", "updates", "still to evaluate", ""):
+    table.add_column("run", overflow="fold")
+    for name in ("state", "updates"):
+        table.add_column(name, no_wrap=True)
+    for name in ("still to evaluate", ""):
         table.add_column(name, overflow="fold")
     for outcome in outcomes:
         run = outcome.run
@@ -234,7 +237,7 @@ def _table(outcomes: list[Outcome]) -> Table:
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line: a table of the runs; exit status 1 if one failed."""
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else _FILE_COLUMNS)
     try:
         outcomes = sweep(tyro.cli(SweepConfig, args=arguments, description=__doc__), console)
     except ValueError as error:
