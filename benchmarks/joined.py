@@ -15,6 +15,7 @@ import json
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -112,9 +113,8 @@ async def _client(bundle: Bundle, n_bots: int) -> BotClient:
     handlers = Handlers(servings, Connections(1, _PATIENCE_S), None)
     desk = Desk(handlers, _AtOnce(), inline_us=float("inf"))
     sockets = Sockets(desk, max_sockets=1, frame_deadline_s=_PATIENCE_S, idle_ttl_s=_PATIENCE_S)
-    client, transport = BotClient("unix:///joined"), StreamTransport("joined", _PATIENCE_S)
-    transport._socket = _Pipe(StreamSocket(sockets, "unix"))
-    client._transport = transport
+    client = BotClient("unix:///joined")
+    client._transport = StreamTransport(partial(_Pipe, StreamSocket(sockets, "unix")))
     return client
 
 

@@ -47,6 +47,7 @@ class Latency:
     bots: tuple[int, ...] = (1, 16, 64, 256)
     turns: int = 1000  # of each transport and each number of bots
     pin: bool = True  # give the server a core of its own, where there are two
+    spin_us: float = 0.0  # how long client and server poll before they sleep
     json: bool = False  # print one JSON line instead of a table
 
 
@@ -57,7 +58,8 @@ def measure(config: Latency, console: Console) -> dict[str, dict[int, NDArray[np
     times: dict[str, dict[int, NDArray[np.float64]]] = {name: {} for name in ("inproc", *_DOORS)}
     with ExitStack() as stack:
         most = str(max(config.bots) * len(_DOORS))
-        server = stack.enter_context(ServerProcess(config.bundle, "--tcp-port", "0", "--max-bots", most))
+        served = ("--tcp-port", "0", "--max-bots", most, "--spin-us", str(config.spin_us))
+        server = stack.enter_context(ServerProcess(config.bundle, *served))
         addresses = server.addresses()
         if config.pin:
             stack.callback(set_apart([server.pid]))
@@ -67,7 +69,8 @@ def measure(config: Latency, console: Console) -> dict[str, dict[int, NDArray[np
             with ExitStack() as clients:
                 play = {"inproc": in_process(bundle, golden, n_bots)}
                 for name, door in _DOORS.items():
-                    play[name] = over(clients.enter_context(BotClient(addresses[door])), bundle, golden, n_bots)
+                    client = clients.enter_context(BotClient(addresses[door], spin_us=config.spin_us))
+                    play[name] = over(client, bundle, golden, n_bots)
                 for name, rows in _rounds(play, config.turns, lambda done: progress.advance(task, done)).items():
                     times[name][n_bots] = np.array(rows)
     return times

@@ -41,9 +41,12 @@ class BotClient:
     on; over TCP and Unix sockets the connection and its bots have ended, so say hello again.
     """
 
-    def __init__(self, url: str, *, timeout_s: float = 5.0, cafile: Path | None = None) -> None:
-        """`https`, `wss` and `tcps` speak TLS; `cafile` has the authorities to trust where not those of the system."""
-        self._transport = open_transport(url, timeout_s, cafile=cafile)
+    def __init__(self, url: str, *, timeout_s: float = 5.0, cafile: Path | None = None, spin_us: float = 0.0) -> None:
+        """`https`, `wss` and `tcps` speak TLS; `cafile` has the authorities to trust where not those of the system.
+
+        An answer is polled for during `spin_us` before the thread sleeps until it comes: for a thread with a core.
+        """
+        self._transport = open_transport(url, timeout_s, cafile=cafile, spin_us=spin_us)
         self._packer = msgpack.Packer()  # kept, for each begins with a large buffer
         self._welcome: Welcome | None = None
 

@@ -48,11 +48,12 @@ class ResumingClient:
         *,
         timeout_s: float = 5.0,
         cafile: Path | None = None,
+        spin_us: float = 0.0,
         limit_s: float = 30.0,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
-        self._client = BotClient(url, timeout_s=timeout_s, cafile=cafile)
+        self._client = BotClient(url, timeout_s=timeout_s, cafile=cafile, spin_us=spin_us)
         self._patience = Patience(limit_s, clock, sleep)
         self._said: dict[str, Any] | None = None
         self._welcome: Welcome | None = None

@@ -6,12 +6,16 @@ after any failure: a late answer must never be read as the answer to the next re
 
 from __future__ import annotations
 
-import socket
+import select
 import ssl
 import struct
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
+
+from protocol.dial import MAX_SPIN_US, Socket, dial
 
 __all__ = [
     "MAX_REPLY_BYTES",
@@ -20,7 +24,6 @@ __all__ = [
     "ReplyError",
     "StreamTransport",
     "Transport",
-    "connected",
     "open_transport",
 ]
 
@@ -61,36 +64,41 @@ class Transport(Protocol):
         """Close the socket, if one is open. A later exchange opens a new one."""
 
 
-def open_transport(url: str, timeout_s: float, *, cafile: Path | None = None) -> Transport:
+def open_transport(url: str, timeout_s: float, *, cafile: Path | None = None, spin_us: float = 0.0) -> Transport:
     """The transport for `http://host:port`, `ws://host:port`, `tcp://host:port` or `unix:///path`.
 
     `https`, `wss` and `tcps` are the same over TLS, to a server whose certificate is for `host` and signed by one of
-    the system's authorities, or by one in `cafile` (PEM) instead. Raises ValueError for other URLs, OSError for a
-    `cafile` that holds none, ImportError where WebSockets need a package that is not installed.
+    the system's authorities, or by one in `cafile` (PEM) instead. An answer is polled for during `spin_us` before the
+    thread sleeps until it comes. Raises ValueError for other URLs, for more than `MAX_SPIN_US` and where nothing can be
+    polled, OSError for a `cafile` that holds none, ImportError where WebSockets need a package that is not installed.
     """
+    if not 0.0 <= spin_us <= MAX_SPIN_US or (spin_us and not hasattr(select, "poll")):
+        raise ValueError(f"spin_us is {spin_us}, expected 0 to {MAX_SPIN_US:g}, and 0 on systems without poll")
     parts = urlsplit(url)
     if parts.scheme == "unix" and parts.path and not parts.netloc:
-        return StreamTransport(parts.path, timeout_s)
+        return StreamTransport(partial(dial, parts.path, timeout_s, None, spin_us))
     door = _DOORS.get(parts.scheme)
     if door is not None and parts.hostname and parts.port:
+        host, port = parts.hostname, parts.port
         tls = None if parts.scheme == door else ssl.create_default_context(cafile=cafile)
+        dialled = partial(dial, (host, port), timeout_s, tls, spin_us)
         if door == "ws" and parts.path in ("", "/", SOCKET_PATH):
-            return _web_socket(parts.hostname, parts.port, timeout_s, tls)
+            return _web_socket(host, port, dialled, is_secure=tls is not None)
         if door == "http" and parts.path in ("", "/"):
-            return HttpTransport(parts.hostname, parts.port, timeout_s, tls)
+            return HttpTransport(host, port, dialled)
         if door == "tcp" and parts.path in ("", "/"):
-            return StreamTransport((parts.hostname, parts.port), timeout_s, tls)
+            return StreamTransport(dialled)
     raise ValueError(
         f"{url!r} is none of http://host:port, ws://host:port, tcp://host:port, unix:///path, or https, wss, tcps"
     )
 
 
-def _web_socket(host: str, port: int, timeout_s: float, tls: ssl.SSLContext | None) -> Transport:
+def _web_socket(host: str, port: int, dialled: Callable[[], Socket], *, is_secure: bool) -> Transport:
     try:
         from protocol.websocket import WebSocketTransport
     except ImportError as error:  # the only transport that needs a package
         raise ImportError("ws:// needs the package `websockets`: install the extra `server`, or it alone") from error
-    return WebSocketTransport(host, port, SOCKET_PATH, timeout_s, tls)
+    return WebSocketTransport(host, port, SOCKET_PATH, dialled, is_secure=is_secure)
 
 
 class HttpTransport:
@@ -99,14 +107,12 @@ class HttpTransport:
     It speaks as much HTTP as the server does: replies with a `Content-Length`. `http.client` takes twice as long.
     """
 
-    def __init__(self, host: str, port: int, timeout_s: float, tls: ssl.SSLContext | None = None) -> None:
-        self._address = host, port
-        self._timeout_s = timeout_s
-        self._tls = tls
+    def __init__(self, host: str, port: int, dialled: Callable[[], Socket]) -> None:
+        self._dial = dialled
         name = f"[{host}]" if ":" in host else host
         rest = f" HTTP/1.1\r\nHost: {name}:{port}\r\nContent-Type: {_CONTENT_TYPE}\r\nContent-Length: "
         self._heads = {kind: f"POST {path}{rest}".encode("ascii") for kind, path in ROUTES.items()}
-        self._socket: socket.socket | None = None
+        self._socket: Socket | None = None
 
     def exchange(self, kind: str, body: bytes, connection: str | None) -> bytes:
         """See Transport. The status is not looked at: an Error message carries its own code."""
@@ -128,7 +134,7 @@ class HttpTransport:
         named = b"" if connection is None else f"\r\n{CONNECTION_HEADER}: {connection}".encode("ascii")
         try:
             if self._socket is None:
-                self._socket = connected(self._address, self._timeout_s, self._tls)
+                self._socket = self._dial()
             self._socket.sendall(b"%b%d%b\r\n\r\n%b" % (self._heads[kind], len(body), named, body))
             reply, is_kept = _read_http(self._socket)
         except OSError:
@@ -140,19 +146,17 @@ class HttpTransport:
 
 
 class StreamTransport:
-    """Frames of a 4-byte big-endian length and that many bytes, over TCP `(host, port)` or a Unix socket's path."""
+    """Frames of a 4-byte big-endian length and that many bytes, over TCP or a Unix socket."""
 
-    def __init__(self, address: tuple[str, int] | str, timeout_s: float, tls: ssl.SSLContext | None = None) -> None:
-        self._address = address
-        self._timeout_s = timeout_s
-        self._tls = tls
-        self._socket: socket.socket | None = None
+    def __init__(self, dialled: Callable[[], Socket]) -> None:
+        self._dial = dialled
+        self._socket: Socket | None = None
 
     def exchange(self, kind: str, body: bytes, connection: str | None) -> bytes:
         """See Transport. The socket is the connection, so neither `kind` nor `connection` travels beside the body."""
         try:
             if self._socket is None:
-                self._socket = self._connect()
+                self._socket = self._dial()
             self._socket.sendall(struct.pack(">I", len(body)) + body)
             return _read_frame(self._socket)
         except OSError:
@@ -165,31 +169,8 @@ class StreamTransport:
             self._socket.close()
             self._socket = None
 
-    def _connect(self) -> socket.socket:
-        if isinstance(self._address, tuple):
-            return connected(self._address, self._timeout_s, self._tls)
-        unconnected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            unconnected.settimeout(self._timeout_s)
-            unconnected.connect(self._address)
-        except OSError:
-            unconnected.close()
-            raise
-        return unconnected
 
-
-def connected(address: tuple[str, int], timeout_s: float, tls: ssl.SSLContext | None = None) -> socket.socket:
-    """A socket to this host and port, over TLS where there is a context of it. Raises OSError (SSLError)."""
-    opened = socket.create_connection(address, timeout=timeout_s)
-    try:
-        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return opened if tls is None else tls.wrap_socket(opened, server_hostname=address[0])
-    except OSError:
-        opened.close()
-        raise
-
-
-def _read_http(source: socket.socket) -> tuple[bytes, bool]:
+def _read_http(source: Socket) -> tuple[bytes, bool]:
     """One reply's body, and whether the server keeps the socket open. Raises ReplyError for what is no such reply."""
     data = source.recv(_READ_BYTES)
     while (end := data.find(b"\r\n\r\n")) < 0:
@@ -215,7 +196,7 @@ def _read_http(source: socket.socket) -> tuple[bytes, bool]:
     return body, is_kept
 
 
-def _read_frame(source: socket.socket) -> bytes:
+def _read_frame(source: Socket) -> bytes:
     """One frame's body, nearly always read in one go. Raises ReplyError for one that is too large, or not alone."""
     data = source.recv(_READ_BYTES)
     if len(data) < 4:
@@ -229,7 +210,7 @@ def _read_frame(source: socket.socket) -> bytes:
     return data[4:] + _read_exactly(source, missing) if missing else data[4:]
 
 
-def _read_exactly(source: socket.socket, size: int) -> bytes:
+def _read_exactly(source: Socket, size: int) -> bytes:
     parts = bytearray()
     while len(parts) < size:
         part = source.recv(min(size - len(parts), 2**20))

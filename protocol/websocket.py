@@ -5,9 +5,8 @@ This module knows nothing about what the bytes say. It needs the package `websoc
 
 from __future__ import annotations
 
-import socket
-import ssl
 from collections import deque
+from collections.abc import Callable
 
 from websockets.client import ClientProtocol
 from websockets.exceptions import InvalidHandshake
@@ -15,7 +14,8 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.uri import WebSocketURI
 
-from protocol.transport import MAX_REPLY_BYTES, ReplyError, connected
+from protocol.dial import Socket
+from protocol.transport import MAX_REPLY_BYTES, ReplyError
 
 __all__ = ["WebSocketTransport"]
 
@@ -25,11 +25,10 @@ _READ_BYTES = 65536
 class WebSocketTransport:
     """One WebSocket at `ws://host:port/path`, or `wss`, which is the connection; no compression, no subprotocol."""
 
-    def __init__(self, host: str, port: int, path: str, timeout_s: float, tls: ssl.SSLContext | None = None) -> None:
-        self._uri = WebSocketURI(tls is not None, host, port, path, "")
-        self._tls = tls
-        self._timeout_s = timeout_s
-        self._socket: socket.socket | None = None
+    def __init__(self, host: str, port: int, path: str, dialled: Callable[[], Socket], *, is_secure: bool) -> None:
+        self._uri = WebSocketURI(is_secure, host, port, path, "")
+        self._dial = dialled
+        self._socket: Socket | None = None
 
     def exchange(self, kind: str, body: bytes, connection: str | None) -> bytes:
         """See Transport. The socket is the connection, so neither `kind` nor `connection` travels beside the body."""
@@ -52,18 +51,18 @@ class WebSocketTransport:
             self._socket.close()
             self._socket = None
 
-    def _connect(self) -> socket.socket:
+    def _connect(self) -> Socket:
         self._protocol = ClientProtocol(self._uri, max_size=MAX_REPLY_BYTES)
         self._messages: deque[bytes] = deque()
         self._fragments: list[bytes] = []
-        self._socket = opened = connected((self._uri.host, self._uri.port), self._timeout_s, self._tls)
+        self._socket = opened = self._dial()
         self._protocol.send_request(self._protocol.connect())
         self._flush(opened)
         while self._protocol.state is State.CONNECTING:
             self._receive(opened)
         return opened
 
-    def _receive(self, opened: socket.socket) -> None:
+    def _receive(self, opened: Socket) -> None:
         data = opened.recv(_READ_BYTES)
         if data:
             self._protocol.receive_data(data)
@@ -91,7 +90,7 @@ class WebSocketTransport:
         elif frame.opcode is Opcode.TEXT:
             raise ReplyError("the server answered with text, expected a binary frame")
 
-    def _flush(self, opened: socket.socket) -> None:
+    def _flush(self, opened: Socket) -> None:
         pending = b"".join(self._protocol.data_to_send())
         if pending:
             opened.sendall(pending)

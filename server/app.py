@@ -78,6 +78,7 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             max_sockets=settings.max_connections,
             frame_deadline_s=settings.frame_deadline_s,
             idle_ttl_s=settings.idle_ttl_s,
+            spin_us=settings.spin_us,
         )
         crowd = Crowd(settings.http_sockets)
         readiness, metrics = watch(settings, handlers, connections, worker, sockets, crowd)
@@ -85,7 +86,7 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             stack.callback(_telemetry(metrics, settings.otlp_endpoint, settings.otlp_every_s).close)
         rest = create_app(HttpDoor(handlers, worker), Probes(handlers, readiness, metrics))
         add_routes(rest, admin)
-        application = Exchange(desk, rest, sockets.brake, body_deadline_s=settings.frame_deadline_s)
+        application = Exchange(desk, rest, sockets.brake, sockets.vigil, body_deadline_s=settings.frame_deadline_s)
         uvicorn_server, http_address = await stack.enter_async_context(
             _http(
                 settings,

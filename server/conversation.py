@@ -145,6 +145,7 @@ class Conversation(asyncio.Protocol):
                 self._sockets.desk.end(answered.reply.connection)
             return
         self._transport.write(self._framed(answered.body))
+        self._sockets.vigil.begin()
         if isinstance(answered.reply, Farewell) or self._sockets.draining:
             self._close()
         elif not self._is_stuck:

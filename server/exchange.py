@@ -28,6 +28,7 @@ from server.answer import Answer, Arrival, refusal
 from server.brake import Brake
 from server.desk import Desk
 from server.openapi import CONNECTION_HEADER, ROUTES
+from server.vigil import Vigil
 
 __all__ = ["FORMATS", "Exchange", "accepted"]
 
@@ -41,9 +42,10 @@ _Headers = dict[bytes, bytes]
 class Exchange:
     """Answers POST requests to the messages' paths at this desk; passes all others on to `rest`."""
 
-    def __init__(self, desk: Desk, rest: ASGIApp, brake: Brake, *, body_deadline_s: float) -> None:
+    def __init__(self, desk: Desk, rest: ASGIApp, brake: Brake, vigil: Vigil, *, body_deadline_s: float) -> None:
         self._desk = desk
         self._brake = brake
+        self._vigil = vigil
         self._rest = rest
         self._body_deadline_s = body_deadline_s
         self._kinds = {path: kind for path, (kind, _) in ROUTES.items()}
@@ -82,6 +84,7 @@ class Exchange:
             may_go_on = not isinstance(error, TooLarge | NoConnection | BadMsgpack | BadJson)
         sending = send if answered.status == 200 else partial(self._send_braked, send)
         await _send(sending, answered, reply_form, may_go_on)
+        self._vigil.begin()
 
     async def _send_braked(self, send: Send, message: Message) -> None:
         if message["type"] == "http.response.start" and message["status"] == Unauthorized.status:

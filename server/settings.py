@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from protocol.dial import MAX_SPIN_US
 from protocol.messages import MAX_DEADLINE_US
 from server.tokens import MIN_CHARS, read_token
 
@@ -53,6 +54,9 @@ class Settings:
     inline_us: float = 500.0
     """A turn that is known to take no longer than this is answered on the event loop itself, which saves the hop to the
     inference thread and is how long one engine may hold up the others. 0 hands every turn to the thread."""
+    spin_us: float = 0.0
+    """After each answer the event loop polls for so long before it sleeps, so that the next request of the same turn
+    need not wake it. For a server with a core of its own: another process on that core would wait meanwhile."""
     idle_ttl_s: float = 60.0
     """A connection that is silent for this long ends, and its bots with it."""
     frame_deadline_s: float = 3.0
@@ -99,6 +103,8 @@ class Settings:
             raise ValueError(f"otlp_every_s is {self.otlp_every_s}, expected at least 0.01")
         if not self.inline_us >= 0:
             raise ValueError("inline_us must not be negative")
+        if not 0 <= self.spin_us <= MAX_SPIN_US:
+            raise ValueError(f"spin_us is {self.spin_us}, expected 0 to {MAX_SPIN_US:g}")
         if self.process is not None and not _PROCESS.fullmatch(self.process):
             raise ValueError(f"process {self.process[:80]!r} does not match {_PROCESS.pattern}")
         if self.default_deadline_us is not None and not 0 < self.default_deadline_us <= MAX_DEADLINE_US:

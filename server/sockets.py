@@ -12,6 +12,7 @@ from typing import Protocol
 from protocol.errors import TooManyConnections
 from server.brake import Brake
 from server.desk import Desk
+from server.vigil import Vigil
 
 __all__ = ["Sockets"]
 
@@ -36,15 +37,19 @@ class Sockets:
     """At most `max_sockets` at a time, all asking at one desk.
 
     A socket closes when its client does, after `idle_ttl_s` of silence between requests, and after `frame_deadline_s`
-    of a request that does not end, a reply that is not taken, or a hello that does not come. `brake` is every door's.
+    of a request that does not end, a reply that is not taken, or a hello that does not come. `brake` and `vigil`, which
+    keeps the event loop awake for `spin_us` after an answer, are every door's.
     """
 
-    def __init__(self, desk: Desk, *, max_sockets: int, frame_deadline_s: float, idle_ttl_s: float) -> None:
+    def __init__(
+        self, desk: Desk, *, max_sockets: int, frame_deadline_s: float, idle_ttl_s: float, spin_us: float = 0.0
+    ) -> None:
         self.desk = desk
         self.frame_deadline_s = frame_deadline_s
         self.idle_ttl_s = idle_ttl_s
         self.draining = False
         self.brake = Brake()
+        self.vigil = Vigil(spin_us)
         self._max_sockets = max_sockets
         self._open: set[_Open] = set()
         self._emptied = asyncio.Event()

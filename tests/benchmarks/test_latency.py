@@ -28,7 +28,7 @@ def test_every_transport_plays_every_turn(tmp_path: Path) -> None:
 def test_json_is_one_line(tmp_path: Path) -> None:
     bundle = make_bundle(tmp_path / "tiny")
     command = [sys.executable, "-m", "benchmarks.latency", "--bundle", str(bundle), "--json"]
-    command += ["--bots", "2", "--turns", "3", "--no-pin"]
+    command += ["--bots", "2", "--turns", "3", "--no-pin", "--spin-us", "200"]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     (line,) = done.stdout.splitlines()
     printed = json.loads(line)

@@ -64,11 +64,18 @@ def test_tokens_come_from_files_too(tmp_path: Path) -> None:
         {"idle_ttl_s": 0.0},
         {"drain_s": -1.0},
         {"token": ""},
+        {"inline_us": -1.0},
     ],
 )
 def test_limits_are_positive(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="must"):
         Settings(bundle=Path("b"), **wrong)
+
+
+@pytest.mark.parametrize("spin_us", [-1.0, 10_001.0, float("nan")])
+def test_a_spin_is_short(spin_us: float) -> None:
+    with pytest.raises(ValueError, match="spin_us"):
+        Settings(bundle=Path("b"), spin_us=spin_us)
 
 
 @pytest.mark.parametrize("process", ["", "P1", "p-1", "p" * 17, "p1\n"])
