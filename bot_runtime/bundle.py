@@ -35,7 +35,8 @@ class Bundle:
     """The manifest and the verified bytes of both graphs. Nothing is read from disk after `load`.
 
     `sha256` is of the manifest, which has the hashes of the other files: it names the whole content. `signed_by` is the
-    fingerprint of the key that signed it, None where no signature was asked for.
+    fingerprint of the key that signed it, None where no signature was asked for. `manifest_json` is what was hashed,
+    for whoever wants to check it.
     """
 
     manifest: Manifest
@@ -43,6 +44,7 @@ class Bundle:
     action: bytes
     sha256: str
     signed_by: str | None = None
+    manifest_json: bytes = b""
 
     @property
     def name(self) -> str:
@@ -80,7 +82,7 @@ class Bundle:
     @classmethod
     def _of(cls, contents: Contents) -> Bundle:
         graphs = contents.files["acquisition.onnx"], contents.files["action.onnx"]
-        return cls(contents.manifest, *graphs, contents.sha256, contents.signed_by)
+        return cls(contents.manifest, *graphs, contents.sha256, contents.signed_by, contents.manifest_json)
 
 
 def _verify_behaviour(bundle: Bundle, golden: bytes, *, with_replay: bool, clock: Callable[[], int]) -> None:

@@ -45,9 +45,10 @@ class _Version(msgspec.Struct):
 
 
 class Contents(NamedTuple):
-    """The manifest, the SHA-256 of its bytes, who signed them (None: not asked), and the bytes of each other file."""
+    """The manifest and its bytes, their SHA-256, who signed them (None: not asked), and each other file's bytes."""
 
     manifest: Manifest
+    manifest_json: bytes
     sha256: str
     signed_by: str | None
     files: dict[str, bytes]
@@ -65,7 +66,7 @@ class Contents(NamedTuple):
             signed_by = keys.signer(content, read_file(path / SIGNATURE_FILE, _MAX_SIGNATURE_BYTES))
         manifest = read_manifest(content)
         files = {file: _read_verified(path / file, manifest.files[file]) for file in FILES}
-        return cls(manifest, hashlib.sha256(content).hexdigest(), signed_by, files)
+        return cls(manifest, content, hashlib.sha256(content).hexdigest(), signed_by, files)
 
 
 def read_manifest(content: bytes) -> Manifest:

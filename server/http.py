@@ -1,4 +1,4 @@
-"""What the HTTP door serves besides messages: what is served and what acquiring costs, probes, documentation.
+"""What the HTTP door serves besides messages: what is served, its head, what acquiring costs, probes, documentation.
 
 This module knows nothing about messages and how they are exchanged (`server.exchange` does).
 """
@@ -6,13 +6,14 @@ This module knows nothing about messages and how they are exchanged (`server.exc
 from __future__ import annotations
 
 import math
+from collections.abc import AsyncIterator
 from functools import partial
 
 import msgspec
 from fastapi import FastAPI
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 
 from protocol import messages
 from protocol.codec import Format
@@ -25,17 +26,18 @@ from protocol.errors import (
 from server.answer import refusal
 from server.exchange import accepted
 from server.handlers import Handlers
-from server.openapi import document, summary
+from server.openapi import HEAD_ROUTES, document, summary
 from server.probes import Probes, check_bearer
 from server.worker import Worker
 
 __all__ = ["HttpDoor", "create_app"]
 
+_PIECE_BYTES = 65536
 _BY_STATUS: dict[int, type[ProtocolError]] = {404: NoRoute, 405: MethodNotAllowed}
 
 
 class HttpDoor:
-    """Answers GET requests."""
+    """Answers GET requests of engines, and those that nothing is served for."""
 
     def __init__(self, handlers: Handlers, worker: Worker) -> None:
         self._handlers = handlers
@@ -49,6 +51,25 @@ class HttpDoor:
         except ProtocolError as error:
             return _refused(error, Format.JSON)
         return Response(summary(serving.manifest), media_type=Format.JSON.value)
+
+    async def manifest(self, request: Request) -> Response:
+        """`manifest.json` of the bundle with the hash in the path, to the byte; needs the token as `bundle` does."""
+        return await self._file(request, "manifest_json", Format.JSON.value)
+
+    async def acquisition(self, request: Request) -> Response:
+        """`acquisition.onnx` of the same, for an engine that runs the head itself."""
+        return await self._file(request, "acquisition", "application/octet-stream")
+
+    async def _file(self, request: Request, part: str, media_type: str) -> Response:
+        try:
+            check_bearer(self._handlers, request)
+            serving = await self._worker.run(partial(self._handlers.servings.of, request.path_params["sha256"]))
+        except ProtocolError as error:
+            return _refused(error, Format.JSON)
+        content = getattr(serving.bots.bundle, part)
+        # What a hash names never changes.
+        headers = {"Content-Length": str(len(content)), "Cache-Control": "private, max-age=31536000, immutable"}
+        return StreamingResponse(_pieces(content), headers=headers, media_type=media_type)
 
     async def not_served(self, request: Request, error: Exception) -> Response:
         """Count what nothing is served for, and say so."""
@@ -71,6 +92,7 @@ def create_app(door: HttpDoor, probes: Probes) -> FastAPI:
     """The application: probes, and documentation at /docs of these and of the message routes."""
     app = FastAPI(title="Budgeted bot runtime", version=str(messages.PROTOCOL_VERSION), redoc_url=None)
     views = {"/v1/bundle": door.bundle, "/v1/costs": door.costs}
+    views |= dict(zip(HEAD_ROUTES, (door.manifest, door.acquisition), strict=True))
     views |= {"/healthz": probes.healthz, "/readyz": probes.readyz, "/metrics": probes.metrics}
     for path, view in views.items():
         app.add_api_route(path, view, methods=["GET"], response_class=Response)
@@ -78,6 +100,12 @@ def create_app(door: HttpDoor, probes: Probes) -> FastAPI:
     app.add_exception_handler(Exception, _internal)
     document(app)
     return app
+
+
+async def _pieces(content: bytes) -> AsyncIterator[memoryview]:
+    """So that no more than one piece is copied for a client that reads slowly."""
+    for start in range(0, len(content), _PIECE_BYTES):
+        yield memoryview(content)[start : start + _PIECE_BYTES]
 
 
 async def _internal(request: Request, error: Exception) -> Response:

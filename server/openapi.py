@@ -18,7 +18,7 @@ from protocol.errors import ERRORS_BY_CODE
 from server.listing import Activate, Listed, Rollback
 from server.store import Record
 
-__all__ = ["ADMIN_ROUTES", "CONNECTION_HEADER", "ROUTES", "document", "summary"]
+__all__ = ["ADMIN_ROUTES", "CONNECTION_HEADER", "HEAD_ROUTES", "ROUTES", "document", "summary"]
 
 CONNECTION_HEADER = "X-Bot-Connection"
 ROUTES: dict[str, tuple[type[messages.Request], type[messages.Reply]]] = {
@@ -34,6 +34,10 @@ ADMIN_ROUTES: dict[str, type[msgspec.Struct]] = {
     "/v1/bundles/{name}/activate": Activate,
     "/v1/bundles/{name}/rollback": Rollback,
 }
+HEAD_ROUTES = {
+    "/v1/bundles/{sha256}/manifest.json": Format.JSON.value,
+    "/v1/bundles/{sha256}/acquisition.onnx": "application/octet-stream",
+}
 _CONNECTION = {
     "name": CONNECTION_HEADER,
     "in": "header",
@@ -48,6 +52,13 @@ _NAME = {
     "description": "A bundle's name.",
     "schema": {"type": "string", "pattern": "^[a-z0-9][a-z0-9_-]{0,63}$"},
 }
+_SHA256 = {
+    "name": "sha256",
+    "in": "path",
+    "required": True,
+    "description": "`bundle_sha256` of Welcome or BotsStarted.",
+    "schema": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+}
 _BEARER: dict[str, list[str]] = {"bearer": []}
 _REF = "#/components/schemas/{name}"
 
@@ -61,6 +72,7 @@ def document(app: FastAPI) -> None:
         drawn = draw()
         drawn["paths"].update({path: {"post": _operation(*pair)} for path, pair in ROUTES.items()})
         drawn["paths"].update(_admin_paths())
+        drawn["paths"].update(_head_paths())
         components = drawn.setdefault("components", {})
         components.setdefault("schemas", {}).update(_schemas())
         components["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
@@ -87,17 +99,28 @@ def _operation(request: type[messages.Request], reply: type[messages.Reply]) -> 
 
 def _admin_paths() -> dict[str, Any]:
     """What operators ask (`server.admin`): JSON alone, with a bearer token."""
-    paths: dict[str, Any] = {"/v1/bundles": {"get": _admin_operation("Bundles", "What there is to serve.", Listed)}}
+    paths: dict[str, Any] = {"/v1/bundles": {"get": _bearer_operation("Bundles", "What there is to serve.", Listed)}}
     paths["/v1/bundles"]["get"]["responses"]["200"]["content"] = _json({"type": "array", "items": _schema(Listed)})
     for path, kind in ADMIN_ROUTES.items():
-        operation = _admin_operation(kind.__name__, str(kind.__doc__), Record)
+        operation = _bearer_operation(kind.__name__, str(kind.__doc__), Record)
         operation["parameters"] = [_NAME]
         operation["requestBody"] = {"required": True, "content": _json(_schema(kind))}
         paths[path] = {"post": operation}
     return paths
 
 
-def _admin_operation(summary: str, description: str, reply: type[msgspec.Struct]) -> dict[str, Any]:
+def _head_paths() -> dict[str, Any]:
+    """What an engine needs to run the acquisition head itself."""
+    paths = {}
+    for path, media_type in HEAD_ROUTES.items():
+        operation = _bearer_operation("Head", "A file of a bundle in memory, to the byte.", messages.Error)
+        operation["parameters"] = [_SHA256]
+        operation["responses"]["200"] = {"description": "The file", "content": {media_type: {"schema": {}}}}
+        paths[path] = {"get": operation}
+    return paths
+
+
+def _bearer_operation(summary: str, description: str, reply: type[msgspec.Struct]) -> dict[str, Any]:
     statuses = sorted({error.status for error in ERRORS_BY_CODE.values()})
     refused = {
         str(status): {"description": _codes(status), "content": _json(_schema(messages.Error))} for status in statuses

@@ -63,6 +63,13 @@ class Servings:
                 return serving
         raise NoBundle(f"no bundle {bundle!r} is served")
 
+    def of(self, sha256: str) -> Serving:
+        """The one in memory with this content, active or held. Raises NoBundle."""
+        for serving in self._loaded:
+            if serving.sha256 == sha256:
+                return serving
+        raise NoBundle("no bundle with this hash is in memory: say hello again")
+
     def successor(self, serving: Serving) -> Serving:
         """The active one of the same name if it keeps what was promised of `serving`, else `serving` itself."""
         active = self._active[serving.name]
