@@ -51,7 +51,7 @@ class Asking:
             deadline.offer(queries)
         if cause is None:
             drawn = self._draw(policy, company, frame, request, returns_to_go_N, noise_NX)
-            if deadline is None or self._haste.settle(deadline, n_bots, allowed_us, "query_probs"):
+            if deadline is None or self._haste.settle(deadline, n_bots, allowed_us, drawn.infer_us, "query_probs"):
                 queries = drawn
         assert queries is not None  # it is drawn, or there is a cause, or a deadline has passed
         return self._turn(company, request, returns_to_go_N, queries, noise_NX, is_prepared=cause is None)

@@ -8,14 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-__all__ = ["OVERRUNS", "PROBE_NS", "Breaker", "Probe"]
+__all__ = ["OVERRUNS", "PAUSES_NS", "Breaker", "Probe"]
 
 OVERRUNS = 3  # in a row
-PROBE_NS = 500_000_000
+PAUSES_NS = (100_000_000, 200_000_000, 500_000_000)
+"""Before the first probe, the second, and all others: most overruns are over soon, and a slow bundle's probes cost."""
 
 
 class Probe(NamedTuple):
-    """What is to be run, and in how many µs it passes: what the last overrun was allowed."""
+    """What is to be run, and in how many µs it passes."""
 
     n_bots: int
     allowed_us: float
@@ -33,19 +34,20 @@ class Breaker:
         self._in_a_row: dict[str, int] = {}
         self._probe = Probe(1, 0.0)
         self._probe_at_ns = 0
+        self._n_failed = 0  # probes, since it opened
         self.is_open = False
         self.n_opened = 0  # times, so far
 
-    def report(self, graph: str, n_bots: int, allowed_us: float, *, overran: bool) -> None:
-        """An inference for which a deadline left `allowed_us`, enough by what is usual, has ended.
+    def report(self, graph: str, probe: Probe, *, overran: bool) -> None:
+        """An inference for which a deadline left enough, by what is usual, has ended; `probe` would pass if it opened.
 
         Each graph counts for itself: the small one would hide for ever that the large one is slow.
         """
         self._in_a_row[graph] = self._in_a_row.get(graph, 0) + 1 if overran else 0
         if self._in_a_row[graph] < OVERRUNS or self.is_open:
             return
-        self._probe = Probe(n_bots, allowed_us)
-        self._probe_at_ns = self._clock() + PROBE_NS
+        self._probe, self._n_failed = probe, 0
+        self._pause()
         self.n_opened += 1
         self.is_open = True
 
@@ -58,4 +60,9 @@ class Breaker:
         if took_us <= self._probe.allowed_us:
             self._in_a_row.clear()
             self.is_open = False
-        self._probe_at_ns = self._clock() + PROBE_NS
+        else:
+            self._n_failed += 1
+            self._pause()
+
+    def _pause(self) -> None:
+        self._probe_at_ns = self._clock() + PAUSES_NS[min(self._n_failed, len(PAUSES_NS) - 1)]

@@ -71,7 +71,7 @@ class Step:
         if chance.may_infer:
             infer_us = self._infer(policy, turn, batch)
             late = chance.deadline
-            if late is None or self._haste.settle(late, batch.n_bots, chance.allowed_us, *chance.graphs):
+            if late is None or self._haste.settle(late, batch.n_bots, chance.allowed_us, infer_us, *chance.graphs):
                 return self._learned(turn, batch, infer_us)
         assert chance.held is not None  # all time there is does not run out
         self._counters.count(chance.held.reasons_N)

@@ -16,7 +16,7 @@ from server.servings import Servings
 
 __all__ = ["probing"]
 
-_LOOK_S = 0.1  # how often; how often a probe runs is the breaker's
+_LOOK_S = 0.05  # how often; how often a probe runs is the breaker's
 _log = logging.getLogger(__name__)
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from bot_runtime.batch import Batch
 from bot_runtime.bots import Bots
-from bot_runtime.breaker import Breaker
+from bot_runtime.breaker import Breaker, Probe
 from bot_runtime.bundle import Bundle
 from bot_runtime.fallback import Reason
 from bot_runtime.policy import Policy
@@ -217,7 +217,7 @@ def test_an_open_breaker_falls_back_at_once_is_not_ready_and_closes_by_a_probe(
         bots = client.start(N)
         assert not play(client, TABLE, bots, range(1))[0].reasons.any()
         for _ in range(3):  # what no probe passes
-            breakers[0].report("act", N, -1.0, overran=True)
+            breakers[0].report("act", Probe(N, -1.0), overran=True)
         assert play(client, TABLE, bots, range(1, 2))[0].reasons.tolist() == [Reason.BREAKER_LAST_ACTION] * N
         ready = http_request(served.addresses["http"], "GET", "/readyz")
         assert ready.status == 503
