@@ -1,7 +1,7 @@
 """A batch: the bots that one message names, in its order, and the arrays that one turn of them reads and writes.
 
-This module knows nothing about handles, messages or what a policy is. L layers, H heads, S cached turns, d numbers a
-head, W numbers of hidden state, E prepared numbers; the other letters are those of `protocol.features`.
+This module knows nothing about handles, messages or what a policy is. L layers, G heads of keys and values, S cached
+turns, d numbers a head, W numbers of hidden state, E prepared numbers; the others are those of `protocol.features`.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ class Rows:
         self.acquired = _zeros(capacity, table.n_costly + table.n_queries)  # costly, query
         self.noise = _zeros(capacity, manifest.action.size)
         self.place = np.zeros(capacity, dtype=np.int64)
-        token = (manifest.n_heads, manifest.n_slots, manifest.head_dim)
-        self.memory = _zeros(manifest.n_layers, 2, capacity, *token)  # keys and values of each layer
+        heads, head = manifest.token
+        ring = (heads, manifest.n_slots, head)
+        self.memory = _zeros(manifest.n_layers, 2, capacity, *ring)  # keys and values of each layer
 
     def first(self, count: int) -> Rows:
         """The same for fewer bots, in the same memory: every array of one layer in one piece."""
@@ -56,7 +57,7 @@ class Batch:
 
     A turn writes `free_NF`, `left_N1` and `target_cost_N1` before the query and `costly_ND`, `query_NM` (0 or 1) and
     `noise_NA` after it. What the graphs answer stands in `probs_NM` and `asked_NE`, then in `action_NA`, `hidden_NW`
-    and `tokens` [L, 2, N, H, d], until any batch of the same contexts runs again.
+    and `tokens` [L, 2, N, G, d], until any batch of the same contexts runs again.
     """
 
     def __init__(
@@ -136,8 +137,8 @@ def _asked(manifest: Manifest, n_bots: int) -> list[tuple[int, ...]]:
 
 
 def _acted(manifest: Manifest, n_bots: int) -> list[tuple[int, ...]]:
-    token = (manifest.n_layers, 2, n_bots, manifest.n_heads, manifest.head_dim)
-    return [(n_bots, manifest.action.size), (n_bots, manifest.width), token]
+    tokens = (manifest.n_layers, 2, n_bots, *manifest.token)
+    return [(n_bots, manifest.action.size), (n_bots, manifest.width), tokens]
 
 
 def _zeros(*shape: int) -> _Floats:

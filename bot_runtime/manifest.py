@@ -53,9 +53,10 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `budget` is the normalised C of the paper, in [0, 1]; 1 means unconstrained. `context_length` 1 means no context at
     all: a network without memory, whose layers, heads and width are 0. `prepared_width` is how many numbers the
     acquisition graph hands on to the action graph, none of which depends on the hidden state; `samples_action` says
-    that the latter reads noise. `target_cost` is the share of the full cost that a budget-conditioned network is asked
-    for by default; None, and the network has no such input. `tolerance` is the largest |Δ| that the golden replay
-    accepts. `precision` is that of the graphs' large matrix products.
+    that the latter reads noise. `n_kv_heads` is how many heads of keys and values the `n_heads` heads share, each of
+    them as many; None, and none is shared. `target_cost` is the share of the full cost that a budget-conditioned
+    network is asked for by default; None, and the network has no such input. `tolerance` is the largest |Δ| that the
+    golden replay accepts. `precision` is that of the graphs' large matrix products.
     """
 
     schema_version: Literal[2]
@@ -76,6 +77,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     files: dict[str, FileEntry]
     provenance: dict[str, str]
     target_cost: float | None = None
+    n_kv_heads: int | None = None
     precision: Literal["fp32", "int8"] = "fp32"
 
     def __post_init__(self) -> None:
@@ -102,15 +104,22 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if not low <= getattr(self, field) <= high:
                 expected = f"{low} to {high} with context_length {self.context_length}"
                 raise ValueError(f"{field} is {getattr(self, field)}, expected {expected}")
+        if self.n_kv_heads is not None and (self.n_kv_heads < 1 or self.n_heads % self.n_kv_heads or not self.n_heads):
+            raise ValueError(f"n_kv_heads is {self.n_kv_heads}, expected a divisor of n_heads, {self.n_heads}, or null")
         if not 1 <= self.prepared_width <= _MAX_DIMENSION:
             raise ValueError(f"prepared_width is {self.prepared_width}, expected 1 to {_MAX_DIMENSION}")
-        if 2 * self.n_layers * self.n_heads * self.n_slots * self.head_dim > _MAX_CONTEXT_NUMBERS:
+        if 2 * self.n_layers * self.n_slots * math.prod(self.token) > _MAX_CONTEXT_NUMBERS:
             raise ValueError(f"one bot's keys and values are more than {_MAX_CONTEXT_NUMBERS} numbers")
 
     @property
     def n_slots(self) -> int:
         """S: how many past turns the key/value cache holds, K - 1."""
         return self.context_length - 1
+
+    @property
+    def token(self) -> tuple[int, int]:
+        """(G, d): heads of a key, and of a value, and numbers of each."""
+        return self.n_heads if self.n_kv_heads is None else self.n_kv_heads, self.head_dim
 
     @property
     def replay_turns(self) -> int:

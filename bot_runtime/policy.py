@@ -1,7 +1,7 @@
 """The two ONNX graphs of a bundle behind two calls.
 
 This module knows nothing about files, bots, turns or budgets. A batch's arrays are bound once to each graph, so that a
-call copies nothing and makes nothing. L layers, H heads, S cached turns, d numbers a head, W numbers of hidden state.
+call copies nothing and makes nothing. L layers, S cached turns, W numbers of hidden state.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def _acquisition_ports(manifest: Manifest) -> tuple[_Ports, _Ports]:
 
 
 def _action_ports(manifest: Manifest) -> tuple[_Ports, _Ports]:
-    table, heads, slots, dim = manifest.features, manifest.n_heads, manifest.n_slots, manifest.head_dim
+    table, slots, (heads, head) = manifest.features, manifest.n_slots, manifest.token
     inputs = {
         "prepared": _floats(manifest.prepared_width),
         "acquired": _floats(table.n_costly + table.n_queries),
@@ -192,8 +192,8 @@ def _action_ports(manifest: Manifest) -> tuple[_Ports, _Ports]:
         inputs["place"], outputs["hidden"] = ("tensor(int64)", (None,)), _floats(manifest.width)
     for layer in range(manifest.n_layers):
         for name in ("key", "value"):
-            inputs[f"{name}s_{layer}"] = _floats(1, heads, slots, dim)
-            outputs[f"{name}_{layer}"] = _floats(1, heads, 1, dim)
+            inputs[f"{name}s_{layer}"] = _floats(1, heads, slots, head)
+            outputs[f"{name}_{layer}"] = _floats(1, heads, 1, head)
     return inputs, outputs
 
 

@@ -43,6 +43,7 @@ def make_bundle(
     context_length: int = 4,
     n_layers: int = 2,
     n_heads: int = 2,
+    n_kv_heads: int | None = None,
     head_dim: int = 8,
     seed: int = 0,
     name: str = "tiny",
@@ -60,6 +61,7 @@ def make_bundle(
     """
     if context_length == 1:
         n_layers = n_heads = head_dim = 0
+        n_kv_heads = None
     path.mkdir(parents=True, exist_ok=True)
     manifest = Manifest(
         schema_version=SCHEMA_VERSION,
@@ -80,6 +82,7 @@ def make_bundle(
         files={file: FileEntry("0" * 64, 1) for file in FILES},
         provenance={"made_by": "tests/bundles.py"},
         target_cost=target_cost,
+        n_kv_heads=n_kv_heads,
     )
     (path / "acquisition.onnx").write_bytes(acquisition_graph(manifest, seed))
     (path / "action.onnx").write_bytes(action_graph(manifest, seed + 1))
@@ -142,7 +145,8 @@ def _cache(manifest: Manifest, past: list[list[np.ndarray]]) -> dict[str, np.nda
     feed = {"place": np.array([turn if turn < slots else slots + turn % slots])}
     for layer in range(manifest.n_layers):
         for kind, name in enumerate(("key", "value")):
-            ring = np.zeros((1, 1, manifest.n_heads, slots, manifest.head_dim), dtype=np.float32)
+            heads, head = manifest.token
+            ring = np.zeros((1, 1, heads, slots, head), dtype=np.float32)
             for t in range(max(0, turn - slots), turn):
                 ring[:, :, :, t % slots] = past[t][2 * layer + kind]
             feed[f"{name}s_{layer}"] = ring

@@ -99,7 +99,7 @@ def _trunk(
     graph: _Graph, x: str, manifest: Manifest, inputs: dict[str, tuple], outputs: dict[str, tuple]
 ) -> tuple[str, dict[str, tuple], dict[str, tuple]]:
     """The attention layers over `x`; their output, and all inputs and outputs with the context's."""
-    heads, slots, dim = manifest.n_heads, manifest.n_slots, manifest.head_dim
+    slots, (heads, dim) = manifest.n_slots, manifest.token
     inputs, outputs = {**inputs, "place": ("N",)}, {**outputs, "hidden": ("N", manifest.width)}
     ages = graph.op("Gather", graph.constant(_ages(slots)), "place", axis=0)  # [N, S]
     for layer in range(manifest.n_layers):
@@ -124,20 +124,25 @@ def _ages(slots: int) -> np.ndarray:
 
 def _attention(graph: _Graph, x: str, layer: int, ages: str, manifest: Manifest) -> str:
     """One causal attention step over the cached turns and this one, with a bias by age."""
-    width, heads, dim, slots = manifest.width, manifest.n_heads, manifest.head_dim, manifest.n_slots
-    split, token, ring = graph.ints(-1, heads, dim), graph.ints(-1, 1, heads, 1, dim), graph.ints(-1, heads, slots, dim)
-    query, key, value = (graph.op("Reshape", graph.linear(x, width, width), split) for _ in range(3))
-    keys, values = (graph.op("Reshape", f"{name}s_{layer}", ring) for name in ("key", "value"))
+    width, slots, (groups, dim) = manifest.width, manifest.n_slots, manifest.token
+    apart, token = graph.ints(-1, groups, manifest.n_heads // groups, dim), graph.ints(-1, 1, groups, 1, dim)
+    ring = graph.ints(-1, groups, slots, dim)
+    query, key, value = (graph.linear(x, width, columns) for columns in (width, groups * dim, groups * dim))
+    query, keys, values = (
+        graph.op("Reshape", query, apart),
+        *(graph.op("Reshape", f"{name}s_{layer}", ring) for name in ("key", "value")),
+    )
     for name, number in (("key", key), ("value", value)):
         graph.op("Reshape", number, token, out=f"{name}_{layer}")
-    ages = graph.op("Unsqueeze", ages, graph.ints(1))  # [N, 1, S]
+    key, value = (graph.op("Reshape", number, graph.ints(-1, groups, dim)) for number in (key, value))
+    ages = graph.op("Unsqueeze", ages, graph.ints(1, 2))  # [N, 1, 1, S]
     bias = graph.scaled(graph.op("Cast", ages, to=TensorProto.FLOAT), 1, -0.2)
-    cached = graph.op("Add", graph.op("Einsum", query, keys, equation="nhd,nhsd->nhs"), bias)
+    cached = graph.op("Add", graph.op("Einsum", query, keys, equation="ngrd,ngsd->ngrs"), bias)
     empty = graph.op("GreaterOrEqual", ages, graph.ints(manifest.context_length))
     cached = graph.op("Where", empty, graph.constant(np.array(_MASKED, dtype=np.float32)), cached)
-    own = graph.op("Unsqueeze", graph.op("Einsum", query, key, equation="nhd,nhd->nh"), graph.ints(2))
-    weight = graph.op("Softmax", graph.op("Concat", cached, own, axis=2), axis=2)
+    own = graph.op("Unsqueeze", graph.op("Einsum", query, key, equation="ngrd,ngd->ngr"), graph.ints(3))
+    weight = graph.op("Softmax", graph.op("Concat", cached, own, axis=3), axis=3)
     everything = graph.op("Concat", values, graph.op("Unsqueeze", value, graph.ints(2)), axis=2)
-    mixed = graph.op("Einsum", weight, everything, equation="nhs,nhsd->nhd")
+    mixed = graph.op("Einsum", weight, everything, equation="ngrs,ngsd->ngrd")
     mixed = graph.op("Reshape", mixed, graph.ints(-1, width))
     return graph.op("Add", x, graph.op("Tanh", graph.linear(mixed, width, width)))

@@ -98,7 +98,8 @@ def sample_queries_incrementally(
     if model.config.acquisition != "learned" or not isinstance(model, BudgetedDecisionTransformer):
         return sample_queries(model, known, uniforms_BTM, fit)
     config, (batch, length, _) = model.config, uniforms_BTM.shape
-    shape = (config.n_layers, batch, config.n_heads, length, config.width // config.n_heads)
+    heads, head = config.token
+    shape = (config.n_layers, batch, heads, length, head)
     keys, values = uniforms_BTM.new_empty(shape), uniforms_BTM.new_empty(shape)
     hidden, query = uniforms_BTM.new_zeros(batch, config.width), torch.empty_like(uniforms_BTM)
     ages = torch.arange(length, 0, -1, device=query.device)[None]

@@ -51,6 +51,7 @@ def build_model(config: TrainConfig, traces: TraceSource) -> BudgetedPolicy:
             width=config.width,
             n_layers=config.n_layers,
             n_heads=config.n_heads,
+            n_kv_heads=config.n_kv_heads,
             encoder_width=config.encoder_width,
             acquisition=config.acquisition,
             acquisition_bias=config.acquisition_bias,

@@ -59,6 +59,7 @@ class TrainConfig:
     width: int = 64  # W
     n_layers: int = 2  # L; hidden layers of width W where there is no memory
     n_heads: int = 4  # H
+    n_kv_heads: int | None = None  # G: heads of keys and values, each shared by H/G heads (None: H, none is shared)
     encoder_width: int = 128  # hidden width of the token encoder and acquisition head
     fourier: int = 4  # octaves of each free number,
     octaves: dict[str, int] = field(default_factory=dict)  # but for the free features named here
@@ -93,6 +94,8 @@ class TrainConfig:
             raise ValueError(f"sampled is {self.sampled}, expected none: only bins can be sampled")
         if self.width % self.n_heads:
             raise ValueError(f"width {self.width} is not a multiple of n_heads {self.n_heads}")
+        if self.n_kv_heads is not None and (self.n_kv_heads < 1 or self.n_heads % self.n_kv_heads):
+            raise ValueError(f"n_kv_heads is {self.n_kv_heads}, expected 1 or more that divide n_heads {self.n_heads}")
         if min((self.fourier, *self.octaves.values())) < 0:
             raise ValueError(f"fourier is {self.fourier} and octaves {self.octaves}, expected 0 or more")
         edges = self.budgets

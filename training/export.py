@@ -139,10 +139,9 @@ def _references(config: TrainConfig) -> dict[str, str]:
 def _context_sizes(sizes: ModelConfig) -> dict[str, int]:
     if not sizes.has_memory:
         return {"context_length": 1, "n_layers": 0, "n_heads": 0, "head_dim": 0, "width": 0}
-    head_dim = sizes.width // sizes.n_heads
-    return {name: getattr(sizes, name) for name in ("context_length", "n_layers", "n_heads", "width")} | {
-        "head_dim": head_dim
-    }
+    names = ("context_length", "n_layers", "n_heads", "width")
+    shared = {} if sizes.n_kv_heads is None else {"n_kv_heads": sizes.n_kv_heads}
+    return {name: getattr(sizes, name) for name in names} | {"head_dim": sizes.token[1]} | shared
 
 
 def main() -> None:

@@ -1,8 +1,7 @@
 """The two graphs that a bundle serves, made by hand from the trained weights with as few nodes as there can be.
 
 What does not depend on a bot is computed here, once: normalisation goes into the weights that follow it, a cosine is a
-sine a quarter turn on, the scale of attention goes into the queries, and the bias by age is a table over the places of
-the ring (docs/adr/0010). Shape letters as in `training.models`; X numbers before the query, P = 2S places of a ring.
+sine a quarter turn on (docs/adr/0010). Shape letters as in `training.models`; X numbers before the query.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from torch import Tensor, nn
 
 from training.action_heads import BinsHead
 from training.action_nodes import action_nodes
+from training.attention_nodes import attention_nodes, bias_nodes
 from training.mlp import BudgetedPerceptron
-from training.models import Attention, BudgetedDecisionTransformer
+from training.models import BudgetedDecisionTransformer
 from training.onnx_graph import OnnxGraph
 from training.policy import COST_OCTAVES, BudgetedPolicy
 
 __all__ = ["acquisition_graph", "action_graph", "reads_noise"]
 
-_MASKED = -1e9
 # A mean so many scales from zero is taken off before the weights: float32 has seven digits, and a sum of two large
 # numbers that cancel would keep few of them.
 _FAR = 100.0
@@ -112,7 +111,7 @@ def _query_nodes(graph: OnnxGraph, model: BudgetedPolicy, x: str, weight: _Doubl
 def action_graph(model: BudgetedPolicy) -> OnnxGraph:
     """prepared [N, E], acquired [N, D + M] (costly numbers, zero where not acquired; the query, 0 or 1), noise [N, A]
     where any is read -> action [N, A]. With memory also place [N] and, of each layer l, keys_l and values_l
-    [N, 1, H, S, h] -> hidden [N, W], key_l and value_l [N, 1, H, 1, h]."""
+    [N, 1, G, S, h] -> hidden [N, W], key_l and value_l [N, 1, G, 1, h]."""
     config, graph = model.config, OnnxGraph()
     graph.inputs["prepared"] = ("N", config.encoder_width)
     graph.inputs["acquired"] = ("N", len(config.owner) + config.n_queries)
@@ -150,17 +149,15 @@ def _encoder_node(graph: OnnxGraph, model: BudgetedPolicy) -> str:
 def _trunk_nodes(graph: OnnxGraph, model: BudgetedDecisionTransformer, x: str) -> str:
     """One turn through every block; the state after it."""
     config, slots = model.config, model.config.context_length - 1
-    heads, head = config.n_heads, config.width // config.n_heads
+    heads, head = config.token
     graph.inputs["place"], graph.outputs["hidden"] = ("N",), ("N", config.width)
     graph.whole.add("place")
-    table = np.stack([_age_table(block.attention) for block in model.blocks], axis=1)  # [P, L, H, 1, S]
-    biases = graph.op("Gather", graph.floats(table), "place", axis=0)
-    biases_L = graph.split(biases, [1] * config.n_layers, axis=1) if config.n_layers > 1 else [biases]
+    biases_L = bias_nodes(graph, [block.attention for block in model.blocks])
     for layer, block in enumerate(model.blocks):
         for name in ("key", "value"):
             graph.inputs[f"{name}s_{layer}"] = ("N", 1, heads, slots, head)
             graph.outputs[f"{name}_{layer}"] = ("N", 1, heads, 1, head)
-        mixed = _attention_nodes(graph, block.attention, layer, _norm(graph, x, block.norm_attention), biases_L[layer])
+        mixed = attention_nodes(graph, block.attention, layer, _norm(graph, x, block.norm_attention), biases_L[layer])
         x = graph.op("Add", _linear(graph, mixed, block.attention.out), x)
         inner, outer = block.mlp[0], block.mlp[-1]
         # One more hidden unit, always 1, carries the second bias, for the residual takes its place.
@@ -168,43 +165,6 @@ def _trunk_nodes(graph: OnnxGraph, model: BudgetedDecisionTransformer, x: str) -
         hidden = graph.op("Relu", graph.gemm(_norm(graph, x, block.norm_mlp), weight, np.append(_numpy(inner.bias), 1)))
         x = graph.gemm(hidden, np.concatenate([_numpy(outer.weight).T, _numpy(outer.bias)[None]]), x)
     return _norm(graph, x, model.norm_out, out="hidden")
-
-
-def _attention_nodes(graph: OnnxGraph, attention: Attention, layer: int, x: str, bias: str) -> str:
-    """Attention of this turn over the ring and itself, [N, W]: the new token is scored beside the ring, so that
-    nothing is concatenated but scores."""
-    heads, head = attention.n_heads, attention.head_dim
-    weight, shift = _numpy(attention.qkv.weight).T.copy(), _numpy(attention.qkv.bias).copy()
-    weight[:, : heads * head] /= math.sqrt(head)
-    shift[: heads * head] /= math.sqrt(head)
-    apart = graph.op("Reshape", graph.gemm(x, weight, shift), graph.ints([-1, 3, heads, 1, head]))
-    names = [f"query_{layer}", f"key_{layer}", f"value_{layer}"]
-    query, key, value = graph.split(apart, [1, 1, 1], axis=1, outs=names)
-    # onnxruntime multiplies by the transpose of the keys as they lie.
-    scores = graph.op("MatMul", query, graph.op("Transpose", f"keys_{layer}", perm=[0, 1, 2, 4, 3]))
-    own = graph.op("ReduceSum", graph.op("Mul", query, key), graph.ints([-1]), keepdims=1)
-    scores = graph.op("Concat", graph.op("Add", scores, bias), own, axis=-1)
-    weights = graph.op("Softmax", scores, axis=-1)
-    past, now = graph.split(weights, [attention.context_length - 1, 1], axis=4)
-    mixed = graph.op("MatMul", past, f"values_{layer}")
-    mixed = graph.op("Add", mixed, graph.op("Mul", now, value))
-    return graph.op("Reshape", mixed, graph.ints([-1, heads * head]))
-
-
-def _age_table(attention: Attention) -> _Doubles:
-    """Score added to each slot at each place of the ring, [P, H, 1, S], less what age 0 gets.
-
-    Before turn t the place is t while t < S: slot s holds turn s, or nothing yet. From then on it is S + t mod S: slot
-    t mod S holds the oldest turn, S ago.
-    """
-    slots = attention.context_length - 1
-    place, slot = np.arange(2 * slots)[:, None], np.arange(slots)
-    filling = place < slots
-    ages = np.where(filling, place - slot, (place - slot - 1) % slots + 1)
-    empty = filling & (slot >= place)
-    bias = _numpy(attention.age_bias)
-    table_PHS = (bias[:, ages] - bias[:, :1, None]).transpose(1, 0, 2)
-    return np.where(empty[:, None], _MASKED, table_PHS)[:, :, None]
 
 
 def _linear(graph: OnnxGraph, x: str, layer: nn.Linear) -> str:

@@ -1,7 +1,8 @@
 """The Budgeted Decision Transformer: one causal trunk under the acquisition head and the action head.
 
-This module knows nothing about losses, sampling or files. Shape letters: B batch, T time, W width, H heads, h head
-width, K context length, L layers, S = K - 1 cached slots; M costly features; the others as in `training.policy`.
+This module knows nothing about losses, sampling or files. Shape letters: B batch, T time, W width, H heads, G heads of
+keys and values, h head width, K context length, L layers, S = K - 1 cached slots; M costly features; the others as in
+`training.policy`.
 
 Token layout (one token a timestep; departs from the paper's three a timestep, see docs/adr/0001): the normalised
 acquired values `q∘o`, the query `q`, the free features and the return-to-go R. The previous action is left out
@@ -30,19 +31,24 @@ def sliding_ages(length: int, device: torch.device | None = None) -> Tensor:
 
 
 class Attention(nn.Module):
-    """Multi-head attention over a sliding span of K timesteps, with a learned bias by age instead of positions."""
+    """Attention over a sliding span of K timesteps, with a learned bias by age, of each head, instead of positions.
+
+    H heads of queries share G heads of keys and values, H/G in a row each (grouped-query attention, Ainslie et al.,
+    EMNLP 2023; one for all: Shazeer, 2019).
+    """
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
-        self.n_heads, self.head_dim = config.n_heads, config.width // config.n_heads
+        self.n_heads, (self.n_kv_heads, self.head_dim) = config.n_heads, config.token
         self.context_length = config.context_length
-        self.qkv = nn.Linear(config.width, 3 * config.width)
+        self.qkv = nn.Linear(config.width, (self.n_heads + 2 * self.n_kv_heads) * self.head_dim)
         self.out = nn.Linear(config.width, config.width)
         self.age_bias = nn.Parameter(torch.zeros(config.n_heads, config.context_length))
 
     def project(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values of tokens [..., W], each shape [..., H, h]."""
-        q, k, v = self.qkv(x).unflatten(-1, (3, self.n_heads, self.head_dim)).unbind(-3)
+        """Queries [..., H, h], keys and values [..., G, h] of tokens [..., W]."""
+        heads = self.qkv(x).unflatten(-1, (-1, self.head_dim))
+        q, k, v = heads.split([self.n_heads, self.n_kv_heads, self.n_kv_heads], dim=-2)
         return q, k, v
 
     def bias(self) -> Tensor:
@@ -50,7 +56,9 @@ class Attention(nn.Module):
         return functional.pad(self.age_bias, (0, 1), value=_MASKED)
 
     def forward(self, x_BTW: Tensor) -> Tensor:
-        q, k, v = (y.transpose(1, 2) for y in self.project(x_BTW))  # each [B, H, T, h]
+        q, k, v = (y.transpose(1, 2) for y in self.project(x_BTW))  # [B, H, T, h], twice [B, G, T, h]
+        shared = self.n_heads // self.n_kv_heads
+        k, v = (y[:, :, None].expand(-1, -1, shared, -1, -1).flatten(1, 2) for y in (k, v))
         ages_TT = sliding_ages(x_BTW.shape[1], x_BTW.device)
         ages_TT = torch.where((ages_TT >= 0) & (ages_TT < self.context_length), ages_TT, self.context_length)
         bias_HTT = self.bias().index_select(1, ages_TT.flatten()).unflatten(1, ages_TT.shape)
@@ -58,18 +66,18 @@ class Attention(nn.Module):
         return self.out(mixed_BHTh.transpose(1, 2).flatten(2))
 
     def step(
-        self, x_NW: Tensor, keys_NHSh: Tensor, values_NHSh: Tensor, ages_NS: Tensor
+        self, x_NW: Tensor, keys_NGSh: Tensor, values_NGSh: Tensor, ages_NS: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One timestep over cached keys and values; equals the last row of `forward` over the same history."""
-        q, k, v = self.project(x_NW)  # each [N, H, h]
-        scale = 1.0 / math.sqrt(self.head_dim)
-        bias = self.bias()
-        cached_NHS = (keys_NHSh @ (q * scale)[..., None])[..., 0] + bias[:, ages_NS].transpose(0, 1)
+        q, k, v = self.project(x_NW)  # [N, H, h], twice [N, G, h]
+        q_NGRh = (q / math.sqrt(self.head_dim)).unflatten(1, (self.n_kv_heads, -1))  # R = H/G that share
+        bias = self.bias().unflatten(0, q_NGRh.shape[1:3])
+        cached_NGRS = q_NGRh @ keys_NGSh.transpose(-1, -2) + bias[:, :, ages_NS].movedim(2, 0)
         # The new token is scored beside the cache: nothing is concatenated but scores.
-        own_NH1 = ((q * scale) * k).sum(-1, keepdim=True) + bias[:, :1]
-        weights = torch.softmax(torch.cat([cached_NHS, own_NH1], dim=-1), dim=-1)
-        mixed_NHh = (weights[..., None, :-1] @ values_NHSh)[..., 0, :] + weights[..., -1:] * v
-        return self.out(mixed_NHh.flatten(1)), k, v
+        own_NGR1 = (q_NGRh * k[:, :, None]).sum(-1, keepdim=True) + bias[..., :1]
+        weights = torch.softmax(torch.cat([cached_NGRS, own_NGR1], dim=-1), dim=-1)
+        mixed_NGRh = weights[..., :-1] @ values_NGSh + weights[..., -1:] * v[:, :, None]
+        return self.out(mixed_NGRh.flatten(1)), k, v
 
 
 class Block(nn.Module):

@@ -38,6 +38,7 @@ class ModelConfig:
     width: int = 64  # W
     n_layers: int = 2  # L
     n_heads: int = 4  # H
+    n_kv_heads: int | None = None  # G, heads of keys and values; None: H
     encoder_width: int = 128  # E, hidden width of the token encoder and of the acquisition head
     acquisition: str = "learned"  # learned | random | all | none: whether queries are learned, drawn, or forced
     acquisition_bias: float = 0.0  # initial logit of every query probability
@@ -58,6 +59,11 @@ class ModelConfig:
     def n_actions(self) -> int:
         """A."""
         return len(self.low)
+
+    @property
+    def token(self) -> tuple[int, int]:
+        """(G, h): heads of a key, and of a value, and numbers of each."""
+        return self.n_kv_heads or self.n_heads, self.width // self.n_heads
 
     @property
     def has_memory(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
 from collections.abc import Iterator
 
@@ -43,7 +44,7 @@ def frames(bundle: Bundle, n_bots: int) -> Iterator[tuple[Queries, Actions]]:
 @pytest.mark.usefixtures("tracing")
 def test_a_steady_frame_takes_its_reply_and_noise_and_gives_back_the_last(long_bundle: Bundle, n_bots: int) -> None:
     manifest = long_bundle.manifest
-    context_bytes = 8 * n_bots * manifest.n_layers * manifest.n_heads * manifest.n_slots * manifest.head_dim
+    context_bytes = 8 * n_bots * manifest.n_layers * manifest.n_slots * math.prod(manifest.token)
     noise_bytes = 32 * max(n_bots, 16) * (manifest.features.n_queries + manifest.action.size)
     traced = np.zeros((WARM_UP + FRAMES, 2), dtype=np.int64)  # held after each frame, and at most in it
     last: tuple[Queries, Actions] | tuple[()] = ()

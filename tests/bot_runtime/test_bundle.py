@@ -39,7 +39,16 @@ def change_golden(path: Path, change: Callable[[dict[str, np.ndarray]], None]) -
 
 
 @pytest.mark.parametrize(
-    "shape", [{}, {"context_length": 2, "n_layers": 1, "n_heads": 1, "head_dim": 3}, {"context_length": 7, "seed": 9}]
+    "shape",
+    [
+        {},
+        {"context_length": 2, "n_layers": 1, "n_heads": 1, "head_dim": 3},
+        {"context_length": 7, "seed": 9},
+        {"n_heads": 4, "n_kv_heads": 1},
+        {"n_heads": 4, "n_kv_heads": 2},
+        {"context_length": 1},
+    ],
+    ids=str,
 )
 def test_loads(tmp_path: Path, shape: dict[str, int]) -> None:
     loaded = Bundle.load(make_bundle(tmp_path / "tiny", **shape))
@@ -97,6 +106,10 @@ def test_missing_linked_or_not_a_file(copy: Path, file: str) -> None:
         {"n_layers": 0},
         {"head_dim": 65537},
         {"n_layers": 60000, "n_heads": 60000},
+        {"n_kv_heads": 0},
+        {"n_kv_heads": -1},
+        {"n_kv_heads": 3},
+        {"n_kv_heads": "1"},
         {"budget": 1.5},
         {"budget": None},
         {"tolerance": 1.0},
@@ -128,6 +141,25 @@ def test_a_manifest_that_says_nothing_of_precision_is_float32(copy: Path) -> Non
     assert Bundle.load(copy).manifest.precision == "fp32"
     change_manifest(copy, tolerance=0.05, precision="int8")
     assert Bundle.load(copy).manifest.precision == "int8"
+
+
+def test_a_manifest_that_says_nothing_of_shared_heads_has_none(copy: Path, tmp_path: Path) -> None:
+    manifest = msgspec.json.decode((copy / "manifest.json").read_bytes())
+    del manifest["n_kv_heads"]
+    (copy / "manifest.json").write_bytes(msgspec.json.encode(manifest))
+    assert Bundle.load(copy).manifest.token == (2, 8)
+    shared = Bundle.load(make_bundle(tmp_path / "shared", n_kv_heads=1)).manifest
+    assert shared.token == (1, 8)
+    change_manifest(copy, n_kv_heads=1)
+    with pytest.raises(BadBundle, match="keys_0 has shape"):
+        Bundle.load(copy)
+
+
+def test_shared_heads_of_a_network_without_any_are_refused(tmp_path: Path) -> None:
+    path = make_bundle(tmp_path / "blind", context_length=1)
+    change_manifest(path, n_kv_heads=1)
+    with pytest.raises(BadBundle, match=r"n_kv_heads is 1, expected a divisor of n_heads, 0"):
+        Bundle.load(path)
 
 
 def test_a_bundle_of_an_earlier_schema_says_what_to_do(copy: Path) -> None:

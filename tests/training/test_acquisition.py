@@ -25,7 +25,14 @@ OWNER = (0, 0, 1, 2, 3, 3)
 
 
 def network(
-    seed: int, *, context_length: int = 4, n_layers: int = 2, spread: float = 1.0, acquisition: str = "learned"
+    seed: int,
+    *,
+    context_length: int = 4,
+    n_layers: int = 2,
+    n_heads: int = 2,
+    n_kv_heads: int | None = None,
+    spread: float = 1.0,
+    acquisition: str = "learned",
 ) -> BudgetedDecisionTransformer:
     """Random weights, with an acquisition head that depends strongly on the past."""
     torch.manual_seed(seed)
@@ -40,7 +47,8 @@ def network(
         context_length=context_length,
         width=8,
         n_layers=n_layers,
-        n_heads=2,
+        n_heads=n_heads,
+        n_kv_heads=n_kv_heads,
         encoder_width=16,
         acquisition=acquisition,
         target_cost=0.3,
@@ -84,12 +92,13 @@ COSTS = torch.tensor([1.0, 2.0, 1.0, 3.0])
     st.integers(1, 3),
     st.sampled_from([0.1, 1.0, 5.0]),
     st.sampled_from(["none", "bot", "frame"]),
+    st.sampled_from([None, 1]),
 )
 def test_same_noise_same_queries(
-    seed: int, length: int, context_length: int, n_layers: int, spread: float, allocation: str
+    seed: int, length: int, context_length: int, n_layers: int, spread: float, allocation: str, n_kv_heads: int | None
 ) -> None:
     """The property that makes parallel training exact, with and without the runtime's allocation in the loop."""
-    model = network(seed, context_length=context_length, n_layers=n_layers, spread=spread)
+    model = network(seed, context_length=context_length, n_layers=n_layers, n_kv_heads=n_kv_heads, spread=spread)
     free, costly, togo, uniforms, _ = batch(seed, 4, length)
     known = know(model, free, costly, togo)
     targets = known.target_cost[:, 0, 0]

@@ -63,8 +63,9 @@ def largest_difference(model: BudgetedPolicy, seed: int = 0, length: int = 23, f
             "hidden": hidden,
         }
     acquisition, action = session(acquisition_graph(model)), session(action_graph(model))
+    heads, head = config.token
     rings = {
-        name: np.full((n, 1, config.n_heads, slots, config.width // config.n_heads), 9.0, dtype=np.float32)
+        name: np.full((n, 1, heads, slots, head), 9.0, dtype=np.float32)
         for layer in range(config.n_layers if config.has_memory else 0)
         for name in (f"keys_{layer}", f"values_{layer}")
     }  # an empty slot's contents must not matter
@@ -102,6 +103,15 @@ def test_incremental_equals_windowed_over_an_episode_longer_than_the_span(
     model = network(seed, context_length=context_length, n_layers=n_layers)
     normalise(model)
     assert largest_difference(model, seed) <= 1e-4
+
+
+@pytest.mark.parametrize("n_kv_heads", [1, 2, 4])
+def test_heads_that_share_keys_and_values(n_kv_heads: int) -> None:
+    """And each head keeps a bias by age of its own."""
+    model = network(8, n_heads=4, n_kv_heads=n_kv_heads)
+    normalise(model)
+    assert model.blocks[0].attention.bias().shape == (4, 5)
+    assert largest_difference(model, 8) <= 1e-4
 
 
 @pytest.mark.parametrize(
@@ -160,6 +170,8 @@ def test_few_nodes_and_no_input_that_is_not_read() -> None:
     before, now = (onnx.load_from_string(graph(model).content()).graph for graph in (acquisition_graph, action_graph))
     assert len(before.node) <= 11
     assert len(now.node) <= 11 + 22 * model.config.n_layers + 10  # ten for the component that is sampled
+    shared = onnx.load_from_string(action_graph(network(0, n_kv_heads=1)).content()).graph
+    assert len(shared.node) <= 11 + 18 * model.config.n_layers + 10
     for graph in (before, now):
         read = {name for node in graph.node for name in node.input}
         assert {port.name for port in graph.input} <= read

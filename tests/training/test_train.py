@@ -141,6 +141,8 @@ def test_refuses_to_resume_with_other_settings(dataset: Path, tmp_path: Path) ->
         ("warmup", 0, "warmup is 0"),
         ("bins", (3, 1), "2 or more for each"),
         ("width", 15, "not a multiple"),
+        ("n_kv_heads", 3, "n_kv_heads is 3, expected 1 or more that divide n_heads 2"),
+        ("n_kv_heads", 0, "n_kv_heads is 0"),
         ("context_length", 1, "2 or more"),
         ("budgets", (0.1,), "two or more rising edges"),
         ("budgets", (0.5, 0.1), "two or more rising edges"),
