@@ -42,6 +42,7 @@ class TrainConfig:
     budgets: tuple[float, ...] = ()  # C is an input, drawn for each window from the strata between these edges
     control: Literal["algorithm-1", "dual"] = "algorithm-1"  # how γ moves (training/control.py)
     penalty_step: float = 0.001  # ε: what γ rises by after a batch above C (Alg. 1); dual: a step of asinh, say 0.01
+    penalty_floor: float = -0.1  # least γ of the dual control: below 0 it pays for asking where budget is left over
     allocation: Literal["none", "bot", "frame"] = "none"  # what is sampled must fit C: each bot, or a frame's together
     frame_bots: int = 20  # windows that share C where `allocation` is frame; batch is a multiple of it
     acquisition_bias: float = 0.0  # initial logit of every query probability
@@ -105,6 +106,8 @@ class TrainConfig:
             raise ValueError(f"budgets is {edges}, expected shares above 0 and at most 1")
         if edges and not edges[0] <= self.budget <= edges[-1]:
             raise ValueError(f"budget is {self.budget}, expected within what is trained, {edges[0]} to {edges[-1]}")
+        if not -1e3 <= self.penalty_floor <= 0.0:
+            raise ValueError(f"penalty_floor is {self.penalty_floor}, expected -1000 to 0")
         if self.allocation == "frame" and self.batch % self.frame_bots:
             raise ValueError(f"batch {self.batch} is not a multiple of frame_bots {self.frame_bots}")
         if self.context_length < 2:

@@ -28,7 +28,7 @@ from training.objectives import penalty
 __all__ = ["Control", "Spent", "draw_costs"]
 
 _FIRST_WEIGHT = 0.05  # of the dual control: features are nearly free at first, so that their worth is seen
-_LEAST_WEIGHT, _MOST_WEIGHT = -0.1, 1e3
+_MOST_WEIGHT = 1e3
 _LINEAR = 0.02  # below it γ moves in equal steps, above it by equal factors
 _LEAST_COST = 1e-3  # the relative excess over C = 0 is taken over this share
 
@@ -73,12 +73,13 @@ class Control:
 
     kind: str  # algorithm-1 | dual
     step: float  # ε
+    floor: float  # least γ of the dual control
     weights: list[float] = field(default_factory=list)
 
     @classmethod
-    def of(cls, kind: str, step: float, strata: int) -> Control:
+    def of(cls, kind: str, step: float, strata: int, floor: float = -0.1) -> Control:
         """γ before the first batch: zero as printed, or small."""
-        return cls(kind, step, [0.0 if kind == "algorithm-1" else _FIRST_WEIGHT] * strata)
+        return cls(kind, step, floor, [0.0 if kind == "algorithm-1" else _FIRST_WEIGHT] * strata)
 
     def penalty(self, cost_BT: Tensor, target_B: Tensor, stratum_B: Tensor, valid_BT: Tensor) -> Tensor:
         """What is added to Δ, a scalar."""
@@ -107,4 +108,4 @@ class Control:
             spent, allowed = (cost * valid).sum().item(), (target * valid).sum().item()
             excess = (spent - allowed) / max(allowed, _LEAST_COST * valid.sum().item())
             moved = math.asinh(self.weights[i] / _LINEAR) + self.step * min(max(excess, -1.0), 1.0)
-            self.weights[i] = min(max(_LINEAR * math.sinh(moved), _LEAST_WEIGHT), _MOST_WEIGHT)
+            self.weights[i] = min(max(_LINEAR * math.sinh(moved), self.floor), _MOST_WEIGHT)

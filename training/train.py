@@ -63,7 +63,7 @@ def new_state(config: TrainConfig, traces: TraceSource) -> TrainState:
     critics = build_critics(model)
     model.to(config.device)
     optimiser = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
-    control = Control.of(config.control, config.penalty_step, max(len(config.budgets) - 1, 1))
+    control = Control.of(config.control, config.penalty_step, max(len(config.budgets) - 1, 1), config.penalty_floor)
     forward = workers.spread(Pass(config, model, _costs(config, traces)), unused=config.acquisition != "learned")
     state = TrainState(model, optimiser, control, forward)
     if critics is not None:

@@ -48,11 +48,12 @@ def test_dual_moves_towards_the_constraint_by_a_bounded_step(cost: float, budget
     assert moved == pytest.approx(0.0, abs=1e-9) or (moved > 0) == (cost > budget)
 
 
-def test_dual_pays_for_asking_where_a_budget_is_left_over() -> None:
-    control = Control.of("dual", 0.01, 1)
+@pytest.mark.parametrize("floor", [-0.1, -1.0, 0.0])
+def test_dual_pays_for_asking_where_a_budget_is_left_over(floor: float) -> None:
+    control = Control.of("dual", 0.01, 1, floor)
     for _ in range(1000):
         control.observe(torch.zeros(1, 1), torch.tensor([0.4]), ONLY, ONES)
-    assert control.weights[0] == pytest.approx(-0.1)
+    assert control.weights[0] == pytest.approx(floor)
 
 
 def test_each_stratum_has_its_own_weight_and_padding_is_not_spent() -> None:
@@ -68,7 +69,7 @@ def test_each_stratum_has_its_own_weight_and_padding_is_not_spent() -> None:
 
 
 def test_dual_penalty_is_the_signed_excess_of_the_mean() -> None:
-    control = Control("dual", 0.01, [2.0, 10.0])
+    control = Control("dual", 0.01, -0.1, [2.0, 10.0])
     cost, target = torch.tensor([[0.2, 0.4], [0.0, 0.0]]), torch.tensor([0.1, 0.05])
     added = control.penalty(cost, target, torch.tensor([0, 1]), torch.ones(2, 2))
     assert added.item() == pytest.approx((2.0 * (0.1 + 0.3) - 10.0 * 0.1) / 4)
