@@ -5,9 +5,10 @@ This module knows nothing about turns, contexts or policies.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from bot_runtime import inputs
@@ -19,7 +20,7 @@ UNMEASURED = np.zeros(0)
 _Bools = NDArray[np.bool_]
 
 
-class Acquired(NamedTuple):
+class Acquired(Struct, frozen=True, eq=False):
     """What came [N, M], what is known of it [N, M] (what failed is not), its values [N, D], µs [1] or [0] if unsaid."""
 
     acquired_NM: _Bools

@@ -84,9 +84,9 @@ class Asking:
     ) -> Queries:
         batch, means = company.batch, request.means
         batch.begin(request.free_NF, returns_to_go_N, means.terms.target_cost_N)
-        drawn = draw(policy, batch, noise_NX, means, request.limits.frame_budget_us, self._clock)
+        drawn = draw(policy, batch, frame, noise_NX, means, request.limits.frame_budget_us, self._clock)
         self._haste.observe("query_probs", company.n_bots, drawn.infer_us)
-        return Queries.of_draw(frame, drawn)
+        return drawn
 
     def _turn(
         self,

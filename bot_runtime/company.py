@@ -39,7 +39,6 @@ class Means:
     calls_cost: bool  # whether any call does
     budget_us: float  # of all bots together; infinite where any has none
     allowed_us: float  # the same, never more than everything costs
-    room_NM: _Floats  # for what `fit` computes on the way
 
     @classmethod
     def of(cls, terms: Terms) -> Means:
@@ -51,7 +50,6 @@ class Means:
             bool(terms.calls_N.any()),
             sum(budgets_N.tolist()),
             sum(np.minimum(budgets_N, terms.full_N).tolist()),
-            np.empty_like(terms.costs_NM),
         )
 
     def fit(
@@ -87,7 +85,7 @@ class Means:
 
     def cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
         """What a query costs, predicted µs, [N]."""
-        cost_us_N: _Floats = np.add.reduce(np.multiply(self.terms.costs_NM, query_NM, out=self.room_NM), axis=1)
+        cost_us_N: _Floats = np.vecdot(self.terms.costs_NM, query_NM)
         if self.calls_cost:
             cost_us_N += np.where(query_NM.any(axis=1), self.terms.calls_N, 0.0)
         return cost_us_N

@@ -7,15 +7,17 @@ function, so that they ask the same questions.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bot_runtime.batch import Batch
 from bot_runtime.company import Means
+from bot_runtime.fallback import non_finite
+from bot_runtime.turns import Queries
 
-__all__ = ["Asker", "Draw", "draw", "finite_rows", "timed_us"]
+__all__ = ["Asker", "draw", "finite_rows", "timed_us"]
 
 
 class Asker(Protocol):
@@ -25,36 +27,27 @@ class Asker(Protocol):
         """From `before_NX` and `target_cost_N1` to `probs_NM` and `asked_NE`."""
 
 
-class Draw(NamedTuple):
-    """What each bot asks for, its predicted cost in µs, the Bernoulli means it was drawn from, and µs of inference.
-
-    `asks_N` says whose means were finite; None: everyone's.
-    """
-
-    query_NM: NDArray[np.bool_]
-    cost_us_N: NDArray[np.float64]
-    probs_NM: NDArray[np.float32]
-    asks_N: NDArray[np.bool_] | None
-    infer_us: float
-
-
 def draw(
     asker: Asker,
     batch: Batch,
+    frame: int,
     noise_NX: NDArray[np.float32],
     means: Means,
     frame_budget_us: float | None,
     clock: Callable[[], int],
-) -> Draw:
+) -> Queries:
     """Run the graph over a batch whose inputs are written, sample by the first M numbers of its noise, and allocate."""
     infer_us = timed_us(clock, asker.query_probs, batch)
     probs_NM = batch.probs_NM.copy()
     query_NM = noise_NX[:, : probs_NM.shape[1]] < probs_NM
-    asks_N = finite_rows(probs_NM)
+    asks_N, reasons_N = finite_rows(probs_NM), None
     if asks_N is not None:
         query_NM &= asks_N[:, None]
+        reasons_N = non_finite(asks_N)
     query_NM, cost_us_N = means.fit(probs_NM, query_NM, frame_budget_us)
-    return Draw(query_NM, cost_us_N, probs_NM, asks_N, infer_us)
+    for array in (query_NM, cost_us_N, probs_NM):
+        array.setflags(write=False)
+    return Queries(frame, query_NM, cost_us_N, probs_NM, infer_us, reasons_N)
 
 
 def finite_rows(probs_NM: NDArray[np.float32]) -> NDArray[np.bool_] | None:

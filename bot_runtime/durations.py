@@ -5,8 +5,6 @@ This module knows nothing about what the work is. Sizes that share a power of tw
 
 from __future__ import annotations
 
-import threading
-from bisect import insort
 from collections import deque
 from collections.abc import Callable
 
@@ -18,20 +16,21 @@ _USUAL_STEP = 1.02  # a median that follows by 2 % a measurement: one outlier mo
 
 
 class Durations:
-    """Measured µs by size, from any thread. `clock` counts ns, is monotonic, and says when something was measured."""
+    """Measured µs by size. `clock` counts ns, is monotonic, and says when something was measured.
+
+    One thread at a time observes; any may ask meanwhile.
+    """
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self._clock = clock
-        self._lock = threading.Lock()
         self._by_magnitude: dict[int, _Measured] = {}
 
     def observe(self, size: int, us: float) -> None:
         """What work of this size has just taken."""
-        magnitude = size.bit_length()
-        with self._lock:
-            if magnitude not in self._by_magnitude:
-                self._by_magnitude[magnitude] = _Measured(us)
-            self._by_magnitude[magnitude].add(self._clock(), us)
+        measured = self._by_magnitude.get(size.bit_length())
+        if measured is None:
+            measured = self._by_magnitude[size.bit_length()] = _Measured(us)
+        measured.add(self._clock(), us)
 
     def predicted_us(self, size: int) -> float:
         """The median of the last second, of this size or, where there was none, a smaller one.
@@ -41,12 +40,11 @@ class Durations:
         trying tells.
         """
         now = self._clock()
-        with self._lock:
-            for magnitude in range(size.bit_length(), -1, -1):
-                measured = self._by_magnitude.get(magnitude)
-                predicted_us = measured.predicted_us(now) if measured is not None else 0.0
-                if predicted_us:
-                    return predicted_us
+        for magnitude in range(size.bit_length(), -1, -1):
+            measured = self._by_magnitude.get(magnitude)
+            predicted_us = measured.predicted_us(now) if measured is not None else 0.0
+            if predicted_us:
+                return predicted_us
         return 0.0
 
     def usual_us(self, size: int) -> float | None:
@@ -60,22 +58,13 @@ class _Measured:
 
     def __init__(self, us: float) -> None:
         self.usual_us = us
-        self._recent: deque[tuple[int, float]] = deque()
-        self._sorted: list[float] = []
+        self._recent: deque[tuple[int, float]] = deque(maxlen=_RECENT)
 
     def add(self, now_ns: int, us: float) -> None:
         self.usual_us *= _USUAL_STEP if us > self.usual_us else 1 / _USUAL_STEP
-        if len(self._recent) == _RECENT:
-            self._drop()
         self._recent.append((now_ns, us))
-        insort(self._sorted, us)
 
     def predicted_us(self, now_ns: int) -> float:
-        while self._recent and now_ns - self._recent[0][0] > _RECENT_NS:
-            self._drop()
-        n_recent = len(self._sorted)
-        return self._sorted[n_recent // 2] if n_recent else 0.0
-
-    def _drop(self) -> None:
-        _, us = self._recent.popleft()
-        self._sorted.remove(us)
+        """Sorted here: every turn is measured, and only those with a deadline ask."""
+        recent = sorted(us for at_ns, us in tuple(self._recent) if now_ns - at_ns <= _RECENT_NS)
+        return recent[len(recent) // 2] if recent else 0.0

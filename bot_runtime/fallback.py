@@ -47,39 +47,46 @@ class Reason(IntEnum):
     BREAKER_SAFE_ACTION = 12
 
 
+_LEARNED = int(Reason.LEARNED)
+
+
 class Counters:
     """How often each rung was used, and how regular the engine's frames were. Numbers only grow."""
 
     def __init__(self) -> None:
-        self._queries = np.zeros(len(Reason), dtype=np.int64)
-        self._actions = np.zeros(len(Reason), dtype=np.int64)
+        self._queries, self._actions = [0] * len(Reason), [0] * len(Reason)
         self.skipped_frames = 0  # frame numbers that a bot never saw, summed over bots
         self.abandoned_queries = 0  # pending queries that a newer frame replaced, summed over bots
 
     def count(self, reasons_N: _Reasons) -> None:
         """Add one action a bot."""
-        self._actions += np.bincount(reasons_N, minlength=len(Reason))
+        _add(self._actions, reasons_N)
 
     def count_learned(self, n_bots: int) -> None:
         """Add one action a bot, all of them learned."""
-        self._actions[Reason.LEARNED] += n_bots
+        self._actions[_LEARNED] += n_bots
 
     def count_queries(self, n_bots: int, reasons_N: _Reasons | None) -> None:
         """Add one query a bot; no reasons: all learned."""
         if reasons_N is None:
-            self._queries[Reason.LEARNED] += n_bots
+            self._queries[_LEARNED] += n_bots
         else:
-            self._queries += np.bincount(reasons_N, minlength=len(Reason))
+            _add(self._queries, reasons_N)
 
     @property
     def reasons(self) -> dict[Reason, int]:
         """Actions so far by reason, one a bot and turn."""
-        return {reason: int(self._actions[reason]) for reason in Reason}
+        return dict(zip(Reason, self._actions, strict=True))
 
     @property
     def query_reasons(self) -> dict[Reason, int]:
         """Queries so far by reason, one a bot and turn, be they ever answered or not."""
-        return {reason: int(self._queries[reason]) for reason in Reason}
+        return dict(zip(Reason, self._queries, strict=True))
+
+
+def _add(counts: list[int], reasons_N: _Reasons) -> None:
+    for reason, count in enumerate(np.bincount(reasons_N, minlength=len(counts)).tolist()):
+        counts[reason] += count
 
 
 def non_finite(asks_N: NDArray[np.bool_]) -> _Reasons | None:

@@ -130,14 +130,15 @@ class FeatureChecks:
 
     def _within(self, numbers: _Floats, limits: tuple[_Floats, _Floats]) -> bool:
         """Whether all are; not where one is NaN."""
-        shape = numbers.shape
-        if shape not in self._rooms:
-            first, second = (room[: numbers.size].reshape(shape) for room in self._room)
-            self._rooms[shape] = (first, second)
-        high_enough, low_enough = self._rooms[shape]
-        np.greater_equal(numbers, limits[0], out=high_enough)
-        np.less_equal(numbers, limits[1], out=low_enough)
-        return int(np.count_nonzero(np.logical_and(high_enough, low_enough, out=low_enough))) == numbers.size
+        rooms = self._rooms.get(numbers.shape)
+        if rooms is None:
+            first, second = (room[: numbers.size].reshape(numbers.shape) for room in self._room)
+            rooms = self._rooms[numbers.shape] = (first, second)
+        high_enough, low_enough = rooms
+        np.greater_equal(numbers, limits[0], high_enough)
+        np.less_equal(numbers, limits[1], low_enough)
+        np.logical_and(high_enough, low_enough, low_enough)
+        return int(np.count_nonzero(low_enough)) == numbers.size
 
 
 def _check_answered(

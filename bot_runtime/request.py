@@ -6,9 +6,10 @@ This module knows nothing about turns, contexts or policies.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from bot_runtime import inputs
@@ -23,7 +24,7 @@ NOTHING_SAID = Limits.checked(0, None, None)
 Numbers = Sequence[float] | NDArray[np.floating] | None
 
 
-class Request(NamedTuple):
+class Request(Struct, frozen=True, eq=False):
     """Free numbers [N, F], rewards [N], what is said of limits, and what follows from it for these bots."""
 
     free_NF: NDArray[np.float32]

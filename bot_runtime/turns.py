@@ -6,16 +6,15 @@ module applies it to the bots of one message at once and keeps what a retry has 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from bot_runtime.acquired import UNMEASURED
 from bot_runtime.company import Company
-from bot_runtime.draw import Draw
-from bot_runtime.fallback import Cause, Counters, non_finite
+from bot_runtime.fallback import Cause, Counters
 from protocol.errors import FrameReused, NoPendingQuery
 from protocol.turn import Event, Phase, is_retry, transition
 
@@ -40,14 +39,6 @@ class Queries(NamedTuple):
     reasons_N: NDArray[np.uint8] | None = None
 
     @classmethod
-    def of_draw(cls, frame: int, drawn: Draw) -> Self:
-        """What was drawn, read-only."""
-        reasons_N = None if drawn.asks_N is None else non_finite(drawn.asks_N)
-        for array in (drawn.query_NM, drawn.cost_us_N, drawn.probs_NM):
-            array.setflags(write=False)
-        return cls(frame, drawn.query_NM, drawn.cost_us_N, drawn.probs_NM, drawn.infer_us, reasons_N)
-
-    @classmethod
     def of_nothing(cls, frame: int, n_bots: int, n_queries: int, cause: Cause) -> Self:
         """No bot asks for anything, without having been asked, read-only."""
         query_NM = np.broadcast_to(np.False_, (n_bots, n_queries))
@@ -66,8 +57,7 @@ class Actions(NamedTuple):
     turns_N: _Ints
 
 
-@dataclass
-class Turn:
+class Turn(Struct, eq=False):  # made anew for every turn: a dataclass takes three times as long
     """One message's bots in one frame: what came, what was answered, and what the second half needs of the first."""
 
     frame: int
@@ -80,7 +70,7 @@ class Turn:
     target_cost_N: NDArray[np.float32]
     is_prepared: bool  # whether the acquisition graph has run: if not, it does before the action graph
     actions: Actions | None = None
-    measured_us: NDArray[np.float64] = field(default_factory=lambda: UNMEASURED)  # what acquiring took, [1], if said
+    measured_us: NDArray[np.float64] = UNMEASURED  # what acquiring took, [1], if said
     taken: bool = False  # both halves came at once, in a `take_turn`
     key: int = _NONE  # in `Turns`
     members: int = 0  # how many of its bots have begun no other turn since, and are still there
