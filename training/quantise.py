@@ -68,8 +68,10 @@ class _Rewriting:
             for name in node.input:
                 self._readers.setdefault(name, []).append(node)
         self._maker = {name: node for node in graph.node for name in node.output}
+        self._outputs = {port.name for port in graph.output}
         self._nodes: list[onnx.NodeProto] = []
-        self._ready: dict[str, tuple[str, float, _Floats]] = {}
+        self._ready: dict[str, tuple[str, float]] = {}
+        self._divisors: dict[str, _Floats] = {}
 
     def large_products(self) -> list[onnx.NodeProto]:
         """The Gemm nodes whose weights are many constants and whose results nothing sharp reads."""
@@ -90,8 +92,11 @@ class _Rewriting:
 
     def rewrite(self, graph: onnx.GraphProto, chosen: set[str], limits: dict[str, _Floats]) -> None:
         """Replace the products with these results."""
-        for result in chosen:
-            self._fold_constant_units(self._maker[result])
+        products = [self._maker[result] for result in chosen]
+        for node in products:
+            self._fold_constant_units(node)
+        for x in dict.fromkeys(node.input[0] for node in products):
+            self._even_out(x, [node for node in products if node.input[0] == x], limits)
         for node in graph.node:
             if node.output[0] in chosen:
                 self._product(node, limits[node.input[0]])
@@ -131,13 +136,45 @@ class _Rewriting:
         self._constants[outer[0].input[1]] = after[live]
         self._constants[f"{outer[0].output[0]}_bias"] = np.maximum(bias[~live], 0.0) @ after[~live]
 
+    def _even_out(self, x: str, readers: list[onnx.NodeProto], limits: dict[str, _Floats]) -> None:
+        """Columns of very different ranges get half of the difference as a scale each, their weights the other half
+        (Xiao et al., SmoothQuant, ICML 2023, eq. 4 with alpha 0.5): in the constants of what makes x where nothing else
+        reads it, else by a product before it is rounded."""
+        weight_X = np.max([np.abs(self._constants[node.input[1]]).max(axis=1) for node in readers], axis=0)
+        limits[x] = limits[x][:, : len(weight_X)]
+        widest_X = np.abs(limits[x]).max(axis=0)
+        if not widest_X.any() or widest_X.max() <= _UNEVEN * _usual(widest_X):
+            return
+        scale_X = np.sqrt(_never_zero(widest_X) / _never_zero(weight_X))
+        limits[x] = limits[x] / scale_X
+        for node in readers:
+            self._constants[node.input[1]] = self._constants[node.input[1]] * scale_X[:, None].astype(np.float32)
+        columns = self._columns(x) if len(self._readers[x]) == len(readers) else []
+        for name in columns:
+            self._constants[name] = self._constants[name] / scale_X.astype(np.float32)
+        if not columns:
+            self._divisors[x] = scale_X
+
+    def _columns(self, x: str) -> list[str]:
+        """The constants whose columns make each column of x as many times larger as they are: those of a normalisation,
+        or of a product with a bias and a Relu behind it. Empty where there are none, or others see what they make."""
+        maker = self._maker.get(x)
+        if maker is None or x in self._outputs:
+            return []
+        if maker.op_type == "LayerNormalization":
+            return list(maker.input[1:])
+        inner = maker.input[0]
+        if maker.op_type != "Relu" or inner in self._outputs or len(self._readers[inner]) > 1:
+            return []
+        product = self._maker.get(inner)
+        named = list(product.input[1:]) if product is not None and product.op_type == "Gemm" else []
+        return named if set(named) <= self._constants.keys() else []
+
     def _product(self, node: onnx.NodeProto, limits_2X: _Floats) -> None:
         x, weight, plus = node.input
         result = node.output[0]
-        units = self._constants[weight].shape[0]
         weight_XO = self._constants[weight].astype(np.float64)
-        number, step, scale_X = self._number(x, limits_2X[:, :units], np.abs(weight_XO).max(axis=1))
-        weight_XO *= scale_X[:, None]
+        number, step = self._number(x, limits_2X)
         bias = self._constants.get(plus if plus in self._constants else f"{result}_bias")
         bias_O = np.zeros(weight_XO.shape[1]) if bias is None else bias.astype(np.float64)
         # So wide a step that the bias fits; it is the weights' where there are any.
@@ -153,27 +190,20 @@ class _Rewriting:
         else:
             self._node("Add", self._node("Gemm", *inputs, out=f"{result}_p"), plus, out=result)
 
-    def _number(self, x: str, limits_2X: _Floats, weight_X: _Floats) -> tuple[str, float, _Floats]:
-        """x as uint8 and back, the step of it, and what each column was divided by before; made once for all readers.
-
-        Columns of very different ranges get half of the difference as a scale each, their weights the other half (Xiao
-        et al., SmoothQuant, ICML 2023, eq. 4 with alpha 0.5). Zero stays zero exactly: what was not acquired must not
-        be felt.
-        """
+    def _number(self, x: str, limits_2X: _Floats) -> tuple[str, float]:
+        """x as uint8 and back, and the step of it; made once for all readers. Zero stays zero exactly: what was not
+        acquired must not be felt."""
         if x in self._ready:
             return self._ready[x]
-        low_X, high_X = _HEADROOM * np.minimum(limits_2X[0], 0.0), _HEADROOM * np.maximum(limits_2X[1], 0.0)
-        widest_X = np.maximum(-low_X, high_X)
-        scale_X, scaled = np.ones(len(widest_X)), x
-        if widest_X.any() and widest_X.max() > _UNEVEN * _usual(widest_X):
-            scale_X = np.sqrt(_never_zero(widest_X) / _never_zero(weight_X))
-            factor = self._constant(f"{x}_f", (1.0 / scale_X).astype(np.float32))
+        scaled = x
+        if x in self._divisors:
+            factor = self._constant(f"{x}_f", (1.0 / self._divisors[x]).astype(np.float32))
             scaled = self._node("Mul", x, factor, out=f"{x}_m")
-        low, high = float((low_X / scale_X).min()), float((high_X / scale_X).max())
+        low, high = _HEADROOM * min(float(limits_2X.min()), 0.0), _HEADROOM * max(float(limits_2X.max()), 0.0)
         step = float(np.float32((high - low) / _STEPS)) or 1.0
         port = (self._constant(f"{x}_s", np.float32(step)), self._constant(f"{x}_z", np.uint8(round(-low / step))))
         whole = self._node("QuantizeLinear", scaled, *port, out=f"{x}_q")
-        self._ready[x] = self._node("DequantizeLinear", whole, *port, out=f"{x}_d"), step, scale_X
+        self._ready[x] = self._node("DequantizeLinear", whole, *port, out=f"{x}_d"), step
         return self._ready[x]
 
     def _restored(self, whole: str, scale_O: _Floats, axis: int) -> str:
