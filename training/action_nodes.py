@@ -23,7 +23,11 @@ def action_nodes(graph: OnnxGraph, head: ActionHead, hidden: str) -> None:
     if isinstance(head, BinsHead):
         _bins(graph, head, hidden, weight, bias)
         return
-    mean = graph.op("Tanh", graph.gemm(hidden, weight[:, : len(low)], bias[: len(low)]))
+    mean = graph.gemm(hidden, weight[:, : len(low)], bias[: len(low)])
+    if (low == -1.0).all() and (high == 1.0).all():
+        graph.op("Tanh", mean, out="action")
+        return
+    mean = graph.op("Tanh", mean)
     graph.gemm(mean, np.diag(0.5 * (high - low)), 0.5 * (low + high), out="action")
 
 

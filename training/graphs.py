@@ -37,10 +37,14 @@ def reads_noise(model: BudgetedPolicy) -> bool:
 def acquisition_graph(model: BudgetedPolicy) -> OnnxGraph:
     """before [N, X] (the last hidden state, free, return-to-go) and, where C is an input, target_cost [N, 1]
     -> query_probs [N, M], prepared [N, E]: the encoder's share of what is known before the query."""
-    config, graph, x = model.config, OnnxGraph(), "before"
-    graph.inputs["before"] = ("N", model.memory_width + config.n_free + 1)
+    config, graph = model.config, OnnxGraph()
+    width = model.memory_width + config.n_free + 1
+    graph.inputs["before"] = ("N", width)
+    # What is prepared does not depend on the hidden state: its product would be of zeros for the most part.
+    bounds = [graph.ints([each]) for each in (model.memory_width, width, 1)]
+    x = graph.op("Slice", "before", *bounds) if model.memory_width else "before"
     mean, scale = _statistics(model)
-    waves, frequencies = model.memory_width + model.wave_number.numpy(), _numpy(model.wave_frequency)
+    waves, frequencies = model.wave_number.numpy(), _numpy(model.wave_frequency)
     if config.cost_range is not None:
         low, high = config.cost_range
         graph.inputs["target_cost"] = ("N", 1)
@@ -63,42 +67,44 @@ def acquisition_graph(model: BudgetedPolicy) -> OnnxGraph:
         weight = np.zeros((rows + 2 * n_waves, config.encoder_width))
         weight[places[: layer.in_features]] = _numpy(layer.weight).T
         if not config.reads_returns:
-            weight[model.memory_width + config.n_free] = 0.0
+            weight[config.n_free] = 0.0
         weight, bias = _normalised(weight, mean, scale)
         return weight, bias + _numpy(layer.bias)
 
     graph.gemm(x, *read(model.encode_context), out="prepared")
-    weight, bias = read(model.acquisition_head.from_context)
-    if model.acquisition_head.from_memory is not None:
-        weight[: model.memory_width] = _numpy(model.acquisition_head.from_memory.weight).T
-    _query_nodes(graph, model, x, weight, bias)
+    _query_nodes(graph, model, x, *read(model.acquisition_head.from_context))
     graph.outputs = {"query_probs": ("N", config.n_queries), "prepared": ("N", config.encoder_width)}
     return graph
 
 
 def _statistics(model: BudgetedPolicy) -> tuple[_Doubles, _Doubles]:
-    """Mean and scale of each number of `before`, [X]; the hidden state is taken as it is."""
-    parts, width = (model.normalise_free, model.normalise_return), model.memory_width
-    mean = np.concatenate([np.zeros(width), *(_numpy(part.mean) for part in parts)])
-    return mean, np.concatenate([np.ones(width), *(_numpy(part.scale) for part in parts)])
+    """Mean and scale of the free numbers and the return-to-go, [F + 1]; the hidden state is taken as it is."""
+    parts = (model.normalise_free, model.normalise_return)
+    return np.concatenate([_numpy(part.mean) for part in parts]), np.concatenate([_numpy(part.scale) for part in parts])
 
 
 def _context_rows(model: BudgetedPolicy, rows: int, n_waves: int) -> NDArray[np.int64]:
-    """Which row of the graph's numbers (`before`, the target cost, all sines, all cosines) each number is that
+    """Which row of the graph's numbers (free, return-to-go, target cost, all sines, all cosines) each number is that
     `BudgetedPolicy.know` puts together."""
     config, free = model.config, len(model.wave_number)
     sines, cosines = rows + np.arange(n_waves), rows + n_waves + np.arange(n_waves)
-    first = model.memory_width + np.arange(config.n_free)
+    first = np.arange(config.n_free)
     cost = np.stack([sines[free:], cosines[free:]], axis=1).ravel()
-    context = [first, sines[:free], cosines[:free], [model.memory_width + config.n_free]]
+    context = [first, sines[:free], cosines[:free], [config.n_free]]
     return np.concatenate([*context, [rows - 1] if config.budget_conditioned else [], cost]).astype(np.int64)
 
 
 def _query_nodes(graph: OnnxGraph, model: BudgetedPolicy, x: str, weight: _Doubles, bias: _Doubles) -> None:
-    """`query_probs` of the numbers `x`, read by the acquisition head's hidden layer with these weights."""
-    config, out = model.config, model.acquisition_head.out
+    """`query_probs` of the numbers `x`, which the acquisition head's hidden layer reads with these weights, and of the
+    hidden state in `before`."""
+    config, head, out = model.config, model.acquisition_head, model.acquisition_head.out
     if config.acquisition == "learned":
-        hidden = graph.op("Relu", graph.gemm(x, weight, bias))
+        x = graph.gemm(x, weight, bias)
+        if head.from_memory is not None:
+            recalled = np.zeros((graph.inputs["before"][1], config.encoder_width))
+            recalled[: model.memory_width] = _numpy(head.from_memory.weight).T
+            x = graph.gemm("before", recalled, x)
+        hidden = graph.op("Relu", x)
         graph.op("Sigmoid", graph.gemm(hidden, _numpy(out.weight).T, _numpy(out.bias)), out="query_probs")
     elif config.acquisition == "random" and config.budget_conditioned:
         graph.gemm("target_cost", np.ones((1, config.n_queries)), np.zeros(config.n_queries), out="query_probs")

@@ -118,6 +118,7 @@ def test_heads_that_share_keys_and_values(n_kv_heads: int) -> None:
     "changes",
     [
         {"bins": ()},
+        {"bins": (), "low": (-1.0, -1.0), "high": (1.0, 1.0)},
         {"sampled": (False, False)},
         {"sampled": (True, True)},
         {"bins": (2, 9), "sampled": (True, True)},
@@ -168,7 +169,7 @@ def test_few_nodes_and_no_input_that_is_not_read() -> None:
     """What they are for: a node costs about a microsecond, whatever it does."""
     model = network(0)
     before, now = (onnx.load_from_string(graph(model).content()).graph for graph in (acquisition_graph, action_graph))
-    assert len(before.node) <= 11
+    assert len(before.node) <= 13
     assert len(now.node) <= 11 + 22 * model.config.n_layers + 10  # ten for the component that is sampled
     shared = onnx.load_from_string(action_graph(network(0, n_kv_heads=1)).content()).graph
     assert len(shared.node) <= 11 + 18 * model.config.n_layers + 10
