@@ -19,6 +19,7 @@ from protocol.values import check_shape, check_values
 __all__ = ["FeatureChecks", "check_costs", "per_bot", "seeds", "turns"]
 
 _MAX_SEED = 2**64 - 1
+_FLOAT, _BOOL = np.dtype(np.float32), np.dtype(np.bool_)
 
 _Floats = NDArray[np.float32]
 _Bools = NDArray[np.bool_]
@@ -73,26 +74,25 @@ class FeatureChecks:
 
     def __init__(self, table: FeatureTable, capacity: int) -> None:
         self._table = table
-        self._free_range, self._costly_range, self._owner = table.free_range, table.costly_range, table.owner
+        self._free_range, self._costly_range = table.free_range, table.costly_range
         low, high = self._costly_range
         self._zero_is_legal = bool((low <= 0.0).all() and (high >= 0.0).all())
-        self._known = np.empty((capacity, table.n_costly), dtype=np.bool_)
         self._room = np.empty((2, capacity * max(table.n_free, table.n_costly)), dtype=np.bool_)
         self._rooms: dict[tuple[int, ...], tuple[_Bools, _Bools]] = {}  # parts of it by shape
 
     def free(self, free_NF: _Floats, handles_N: NDArray[np.int64]) -> None:
         """Raises BadShape, NonFinite or OutOfRange unless these are legal free numbers of these bots."""
-        check_shape("free", free_NF, (handles_N.size, self._table.n_free), np.float32)
+        check_shape("free", free_NF, (handles_N.size, self._table.n_free), _FLOAT)
         if not self._within(free_NF, self._free_range):
             check_values(free_NF, None, handles_N, self._table.free, self._free_range)
 
     def query(self, acquired_NM: _Bools, failed_NM: _Bools | None, handles_N: NDArray[np.int64]) -> _Bools:
         """What an engine that decides for itself asked for: what it acquired or failed, [N, M]. Raises BadShape."""
         shape = handles_N.size, self._table.n_queries
-        check_shape("acquired", acquired_NM, shape, np.bool_)
+        check_shape("acquired", acquired_NM, shape, _BOOL)
         if failed_NM is None:
             return acquired_NM.copy()
-        check_shape("failed", failed_NM, shape, np.bool_)
+        check_shape("failed", failed_NM, shape, _BOOL)
         asked_NM: _Bools = acquired_NM | failed_NM
         return asked_NM
 
@@ -112,16 +112,16 @@ class FeatureChecks:
         covered; NonFinite and OutOfRange for acquired values. Other values are never looked at.
         """
         table, n_bots = self._table, handles_N.size
-        check_shape("acquired", acquired_NM, (n_bots, table.n_queries), np.bool_)
-        check_shape("values", costly_ND, (n_bots, table.n_costly), np.float32)
+        check_shape("acquired", acquired_NM, (n_bots, table.n_queries), _BOOL)
+        check_shape("values", costly_ND, (n_bots, table.n_costly), _FLOAT)
         known_NM = query_NM
         if failed_NM is not None:
-            check_shape("failed", failed_NM, (n_bots, table.n_queries), np.bool_)
+            check_shape("failed", failed_NM, (n_bots, table.n_queries), _BOOL)
             known_NM = query_NM & ~failed_NM
             _check_answered(acquired_NM | failed_NM, query_NM, handles_N, table.costly)
         elif acquired_NM.tobytes() != query_NM.tobytes():
             _check_answered(acquired_NM, query_NM, handles_N, table.costly)
-        known_ND = known_NM.take(self._owner, axis=1, out=self._known[:n_bots], mode="clip")
+        known_ND = table.spread(known_NM)
         out_ND.fill(0.0)
         np.copyto(out_ND, costly_ND, where=known_ND)
         if not (self._zero_is_legal and self._within(out_ND, self._costly_range)):

@@ -20,12 +20,18 @@ _AHEAD = 16  # turns of one bot; fewer of more bots
 
 def mix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """SplitMix64's output function of each element, any shape."""
+    mixed = _half_mixed(state)
+    mixed ^= mixed >> np.uint64(31)
+    return mixed
+
+
+def _half_mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The same without its last step, which leaves the highest 31 bits as they are."""
     mixed = state >> np.uint64(30)
     mixed ^= state
     mixed *= _MIX_1
     mixed ^= mixed >> np.uint64(27)
     mixed *= _MIX_2
-    mixed ^= mixed >> np.uint64(31)
     return mixed
 
 
@@ -52,9 +58,9 @@ def _numbers(
     rows = turns.astype(np.uint64)
     rows *= _GOLDEN
     rows += streams_N
-    bits = mix(np.add.outer(mix(rows), indices))
+    bits = _half_mixed(np.add.outer(mix(rows), indices))
     bits >>= np.uint64(40)
-    numbers = bits.astype(np.float32)
+    numbers = bits.view(np.int64).astype(np.float32)  # twice as fast as from unsigned ones
     numbers *= _FLOAT32_STEP
     return numbers
 

@@ -19,6 +19,9 @@ from protocol.messages import Bits, Blob
 
 __all__ = ["bits", "floats", "pack_bits", "pack_floats", "unpack_values"]
 
+# Made once, and handed on by position below: names of types and of arguments are looked up in every call.
+_FLOAT, _BYTE = np.dtype("<f4"), np.dtype(np.uint8)
+
 
 def floats(blob: Blob, shape: tuple[int, int], name: str) -> NDArray[np.float32]:
     """A blob as float32 of `shape`; raises BadShape, OutOfRange (a number that float32 cannot hold)."""
@@ -37,8 +40,8 @@ def bits(blob: Bits, shape: tuple[int, int], name: str) -> NDArray[np.bool_]:
     row_bytes = -(-columns // 8)
     if len(blob) != rows * row_bytes:
         raise BadShape(f"{name} has {len(blob)} bytes, expected {rows} rows of {row_bytes} ({columns} bits)")
-    packed = np.frombuffer(blob, dtype=np.uint8).reshape(rows, row_bytes)
-    unpacked = np.unpackbits(packed, axis=1, bitorder="little").view(np.bool_)
+    packed = np.frombuffer(blob, _BYTE).reshape(rows, row_bytes)
+    unpacked = np.unpackbits(packed, 1, None, "little").view(np.bool_)
     if unpacked.shape[1] == columns:
         return unpacked
     if unpacked[:, columns:].any():
@@ -50,14 +53,14 @@ def pack_floats(array: NDArray[np.float32], form: Format) -> Blob:
     """float32 [N, n] as the blob of this format."""
     if form is Format.JSON:
         return cast("list[list[float]]", array.tolist())
-    return array.astype("<f4", copy=False).tobytes()
+    return np.asarray(array, _FLOAT).tobytes()
 
 
 def pack_bits(array: NDArray[np.bool_], form: Format) -> Bits:
     """bool [N, M] as the bits of this format."""
     if form is Format.JSON:
         return cast("list[list[int]]", array.astype(np.uint8).tolist())
-    return np.packbits(array, axis=1, bitorder="little").tobytes()
+    return np.packbits(array, 1, "little").tobytes()
 
 
 def unpack_values(values: Blob, acquired_NM: NDArray[np.bool_], table: FeatureTable) -> NDArray[np.float32]:
@@ -65,8 +68,8 @@ def unpack_values(values: Blob, acquired_NM: NDArray[np.bool_], table: FeatureTa
 
     Raises BadShape (too few or too many numbers for what `acquired` says), OutOfRange as `floats` does.
     """
-    present_ND = acquired_NM.take(table.owner, axis=1)
-    dense_ND = np.zeros(present_ND.shape, dtype=np.float32)
+    present_ND = table.spread(acquired_NM)
+    dense_ND = np.zeros(present_ND.shape, np.float32)
     dense_ND[present_ND] = _ragged(values, present_ND)
     return dense_ND
 
@@ -87,7 +90,7 @@ def _ragged(values: Blob, present_ND: NDArray[np.bool_]) -> NDArray[np.float32]:
 def _from_bytes(blob: bytes, shape: tuple[int, int], name: str) -> NDArray[np.float32]:
     if len(blob) != 4 * shape[0] * shape[1]:
         raise BadShape(f"{name} has {len(blob)} bytes, expected {4 * shape[0] * shape[1]} for float32 {list(shape)}")
-    return np.frombuffer(blob, dtype="<f4").reshape(shape)
+    return np.frombuffer(blob, _FLOAT).reshape(shape)
 
 
 def _check_rows(rows: Sequence[Sequence[float]], shape: tuple[int, int], name: str) -> None:

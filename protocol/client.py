@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from protocol.errors import NoConnection, ProtocolError
 from protocol.features import CostModel
-from protocol.packing import add_acquired, add_number, add_numbers, cost_model_dict, handles_of, matrix
+from protocol.packing import FLOAT, add_acquired, add_number, add_numbers, cost_model_dict, handles_of, matrix
 from protocol.replies import (
     Actions,
     Queries,
@@ -129,7 +129,7 @@ class BotClient:
         """
         table, handles = self.welcome.features, handles_of(bots)
         message = {"type": "request_queries", "frame": int(frame), "bots": handles}
-        message["free"] = matrix(free, "<f4", (len(handles), table.n_free), "free").tobytes()
+        message["free"] = matrix(free, FLOAT, (len(handles), table.n_free), "free").tobytes()
         add_numbers(message, "rewards", rewards)
         add_number(message, "frame_budget_us", frame_budget_us)
         add_numbers(message, "budgets_us", budgets_us)
@@ -189,7 +189,7 @@ class BotClient:
         """
         welcome, handles = self.welcome, handles_of(bots)
         table, message = welcome.features, {"type": "take_turn", "frame": int(frame), "bots": handles}
-        message["free"] = matrix(free, "<f4", (len(handles), table.n_free), "free").tobytes()
+        message["free"] = matrix(free, FLOAT, (len(handles), table.n_free), "free").tobytes()
         add_acquired(message, table, len(handles), acquired, costly, failed)
         add_numbers(message, "rewards", rewards)
         add_number(message, "acquire_us", acquire_us)

@@ -98,6 +98,15 @@ class FeatureTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         """Index of the costly feature that each costly number belongs to, shape [D]."""
         return np.repeat(np.arange(self.n_queries), self.sizes)
 
+    def spread(self, mask_NM: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Of each costly number, shape [N, D], what is said of the feature that it belongs to."""
+        return mask_NM.repeat(self._repeats, 1)
+
+    @cached_property
+    def _repeats(self) -> int | NDArray[np.int64]:
+        sizes = set(self.sizes.tolist())
+        return sizes.pop() if len(sizes) == 1 else self.sizes  # one for all takes a fifth less time
+
     @cached_property
     def free_range(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Lowest and highest legal value of each free number, each shape [F]."""

@@ -13,7 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from protocol.errors import BadShape
 from protocol.features import CostModel, FeatureTable
 
-__all__ = ["add_acquired", "add_number", "add_numbers", "cost_model_dict", "handles_of", "matrix"]
+__all__ = ["FLOAT", "add_acquired", "add_number", "add_numbers", "cost_model_dict", "handles_of", "matrix"]
+
+FLOAT, _BOOL = np.dtype("<f4"), np.dtype(np.bool_)  # made once: names of types are looked up in every call
 
 
 def cost_model_dict(cost_model: CostModel) -> dict[str, Any]:
@@ -36,12 +38,12 @@ def add_acquired(
     failed: ArrayLike | None,
 ) -> None:
     """Add `acquired` [N, M], `values` of the dense `costly` [N, D] and, if given, `failed` [N, M]; raises BadShape."""
-    acquired_NM = matrix(acquired, "?", (n_bots, table.n_queries), "acquired")
-    costly_ND = matrix(costly, "<f4", (n_bots, table.n_costly), "costly")
+    acquired_NM = matrix(acquired, _BOOL, (n_bots, table.n_queries), "acquired")
+    costly_ND = matrix(costly, FLOAT, (n_bots, table.n_costly), "costly")
     message["acquired"] = _pack_bits(acquired_NM)
-    message["values"] = costly_ND[acquired_NM.take(table.owner, axis=1)].tobytes()
+    message["values"] = costly_ND[table.spread(acquired_NM)].tobytes()
     if failed is not None:
-        message["failed"] = _pack_bits(matrix(failed, "?", acquired_NM.shape, "failed"))
+        message["failed"] = _pack_bits(matrix(failed, _BOOL, acquired_NM.shape, "failed"))
 
 
 def add_number(message: dict[str, Any], name: str, value: float | None) -> None:
@@ -56,13 +58,13 @@ def add_numbers(message: dict[str, Any], name: str, values: ArrayLike | None) ->
         message[name] = np.asarray(values, dtype=np.float64).tolist()
 
 
-def matrix(array: ArrayLike, dtype: str, shape: tuple[int, ...], name: str) -> NDArray[Any]:
+def matrix(array: ArrayLike, dtype: np.dtype[Any], shape: tuple[int, ...], name: str) -> NDArray[Any]:
     """The array in this type; raises BadShape unless it is of this shape."""
-    matrix = np.ascontiguousarray(array, dtype=dtype)
+    matrix = np.ascontiguousarray(array, dtype)
     if matrix.shape != shape:
         raise BadShape(f"{name} has shape {list(matrix.shape)}, expected {list(shape)}")
     return matrix
 
 
 def _pack_bits(array_NM: NDArray[np.bool_]) -> bytes:
-    return np.packbits(array_NM, axis=1, bitorder="little").tobytes()
+    return np.packbits(array_NM, 1, "little").tobytes()

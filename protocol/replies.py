@@ -27,6 +27,7 @@ __all__ = [
     "read_welcome",
 ]
 
+_FLOAT, _BYTE, _BOOL = np.dtype("<f4"), np.dtype(np.uint8), np.dtype(np.bool_)
 _MAX_ARRAY = 65536  # msgpack reserves memory for the length that an array claims, at every depth
 _FAULTS = ValueError, KeyError, TypeError, AttributeError, OverflowError
 _REPLY_TO = {
@@ -152,11 +153,11 @@ def read_bots_started(reply: dict[str, Any], welcome: Welcome) -> tuple[NDArray[
 def read_queries(reply: dict[str, Any], bots: int, table: FeatureTable) -> Queries:
     """The fields of a `queries` for N = `bots`; raises ReplyError."""
     try:
-        bytes_NB = np.frombuffer(reply["queries"], dtype=np.uint8).reshape(bots, -(-table.n_queries // 8))
-        queries_NM = np.unpackbits(bytes_NB, axis=1, count=table.n_queries, bitorder="little").view(np.bool_)
-        cost_us_N = np.array(reply["cost_us"], dtype=np.float64).reshape(bots)
+        bytes_NB = np.frombuffer(reply["queries"], _BYTE).reshape(bots, -(-table.n_queries // 8))
+        queries_NM = np.unpackbits(bytes_NB, 1, table.n_queries, "little").view(_BOOL)
+        cost_us_N = np.array(reply["cost_us"], np.float64).reshape(bots)
         reasons = reply.get("reasons")
-        reasons_N = _reasons(reasons, bots) if reasons else np.zeros(bots, dtype=np.uint8)
+        reasons_N = _reasons(reasons, bots) if reasons else np.zeros(bots, _BYTE)
         infer_us, late = float(reply["infer_us"]), bool(reply.get("late"))
         return Queries(int(reply["frame"]), queries_NM, cost_us_N, infer_us, reasons_N, late)
     except _FAULTS as error:
@@ -166,19 +167,19 @@ def read_queries(reply: dict[str, Any], bots: int, table: FeatureTable) -> Queri
 def read_actions(reply: dict[str, Any], bots: int, action: ActionSpec) -> Actions:
     """The fields of an `actions` for N = `bots`; raises ReplyError."""
     try:
-        actions_NA = np.frombuffer(reply["actions"], dtype="<f4").reshape(bots, action.size)
+        actions_NA = np.frombuffer(reply["actions"], _FLOAT).reshape(bots, action.size)
         reasons_N = _reasons(reply["reasons"], bots)
         infer_us, late = float(reply["infer_us"]), bool(reply.get("late"))
         turns, hidden = reply.get("turns"), reply.get("hidden")
-        turns_N = None if turns is None else np.array(turns, dtype=np.int64).reshape(bots)
-        hidden_NW = None if hidden is None else np.frombuffer(hidden, dtype="<f4").reshape(bots, -1)
+        turns_N = None if turns is None else np.array(turns, np.int64).reshape(bots)
+        hidden_NW = None if hidden is None else np.frombuffer(hidden, _FLOAT).reshape(bots, -1)
         return Actions(int(reply["frame"]), actions_NA, reasons_N, infer_us, turns_N, hidden_NW, late)
     except _FAULTS as error:
         raise _unreadable("submit_features", error) from error
 
 
 def _reasons(reasons: list[int], bots: int) -> NDArray[np.uint8]:
-    return np.array(reasons, dtype=np.uint8).reshape(bots)
+    return np.array(reasons, _BYTE).reshape(bots)
 
 
 def _read_version(reply: dict[str, Any]) -> dict[str, Any]:

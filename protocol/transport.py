@@ -46,6 +46,7 @@ _REPEATABLE = {
     "take_turn",
 }  # a turn's retry gets the same answer and changes nothing
 _CONTENT_TYPE = "application/msgpack"
+_PREFIX = struct.Struct(">I")
 _READ_BYTES = 65536
 _MAX_HEAD_BYTES = 65536
 
@@ -157,7 +158,7 @@ class StreamTransport:
         try:
             if self._socket is None:
                 self._socket = self._dial()
-            self._socket.sendall(struct.pack(">I", len(body)) + body)
+            self._socket.sendall(_PREFIX.pack(len(body)) + body)
             return _read_frame(self._socket)
         except OSError:
             self.close()
@@ -201,7 +202,7 @@ def _read_frame(source: Socket) -> bytes:
     data = source.recv(_READ_BYTES)
     if len(data) < 4:
         data += _read_exactly(source, 4 - len(data))
-    (size,) = struct.unpack_from(">I", data)
+    (size,) = _PREFIX.unpack_from(data)
     if size > MAX_REPLY_BYTES:
         raise ReplyError(f"the server announces a reply of {size} bytes, more than {MAX_REPLY_BYTES}")
     missing = size - (len(data) - 4)
