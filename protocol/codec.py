@@ -17,12 +17,21 @@ from protocol.errors import BadJson, BadMsgpack, BadSchema, ProtocolError, TooDe
 from protocol.features import FeatureTable
 from protocol.messages import MAX_BOTS_PER_MESSAGE, Request
 
-__all__ = ["MAX_DETAIL_CHARS", "Format", "body_limit", "decode", "decode_request", "encode", "peek_deadline_us"]
+__all__ = [
+    "LEAST_LIMIT_BYTES",
+    "MAX_DETAIL_CHARS",
+    "Format",
+    "body_limit",
+    "decode",
+    "decode_request",
+    "encode",
+    "peek_deadline_us",
+]
 
 MAX_DETAIL_CHARS = 300
 _HANDLE_BYTES = 21  # a 63-bit integer in JSON with its comma
 _BIT_BYTES = 2  # `0,`
-_FIXED_BYTES = 16384  # names, brackets, the longest token with every character escaped
+LEAST_LIMIT_BYTES = 16384  # names, brackets, the longest token with every character escaped
 # A list of one number costs 100 bytes of memory and 4 of JSON. msgspec bounds lists before it makes them in msgpack, in
 # JSON only afterwards; no message has more lists than this.
 _MAX_JSON_LISTS = 4 * MAX_BOTS_PER_MESSAGE + 4096
@@ -53,12 +62,12 @@ def body_limit(table: FeatureTable, max_bots: int, form: Format) -> int:
     """Bytes of the largest message that can make sense: `max_bots` bots of this table, in lists of the widest numbers.
 
     A bot has at most F + 4 numbers, D numbers and 2 M bits in a whole turn, and 5 numbers in a start.
-    With no bots it is the largest hello.
+    With no bots it is the largest hello. It is never less than `LEAST_LIMIT_BYTES`.
     """
     number_bytes = _NUMBER_BYTES[form]
     per_turn = number_bytes * (table.n_free + table.n_costly + 4) + 2 * _BIT_BYTES * table.n_queries
     per_bot = _HANDLE_BYTES + 16 + max(per_turn, 5 * number_bytes)
-    return _FIXED_BYTES + number_bytes * table.n_queries + per_bot * max_bots
+    return LEAST_LIMIT_BYTES + number_bytes * table.n_queries + per_bot * max_bots
 
 
 def peek_deadline_us(body: bytes, form: Format) -> float | None:

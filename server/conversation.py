@@ -29,6 +29,7 @@ class Conversation(asyncio.Protocol):
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._due_s = 0.0  # when it is too late, on the event loop's clock
+        self._silence_s = sockets.frame_deadline_s  # how long may pass between requests
         self.is_busy = False
         self._is_begun = False  # part of a request has come
         self._is_stuck = False  # the client does not take what it was sent
@@ -101,7 +102,7 @@ class Conversation(asyncio.Protocol):
         """See asyncio.Protocol."""
         self._is_stuck = False
         if not (self.is_busy or self._is_over):
-            self._rest()
+            self._expect(self._silence_s)
             self._proceed()
 
     def finish(self) -> None:
@@ -138,7 +139,7 @@ class Conversation(asyncio.Protocol):
     def _send(self, answered: Answer) -> None:
         self.is_busy = False
         if isinstance(answered.reply, Welcome):
-            self._connection = answered.reply.connection
+            self._connection, self._silence_s = answered.reply.connection, self._sockets.idle_ttl_s
             self._welcomed(answered.reply)
         if self._is_over:  # the client has left in the meantime
             if isinstance(answered.reply, Welcome):
@@ -149,32 +150,31 @@ class Conversation(asyncio.Protocol):
         if isinstance(answered.reply, Farewell) or self._sockets.draining:
             self._close()
         elif not self._is_stuck:
-            self._rest()
+            self._expect(self._silence_s)  # from now on, whatever comes that is no request
             if self._has_part:
                 self.is_busy = True  # it is, in the next round of the event loop: other sockets have their turn first
                 self._loop.call_soon(self._go_on)
             else:
-                self._wait()
+                self._listen()
 
     def _go_on(self) -> None:
         self.is_busy = False
         if not (self._is_over or self._is_stuck):
             self._proceed()
 
-    def _rest(self) -> None:
-        """From now on, whatever comes that is no request, the time counts until the next one begins."""
-        is_known = self._connection is not None
-        self._expect(self._sockets.idle_ttl_s if is_known else self._sockets.frame_deadline_s)
-
     def _wait(self) -> None:
         """For the rest of a request, or for the next one."""
-        if self._is_eof:
-            self._close()
-            return
-        self._read_on()
-        if self._has_part and not self._is_begun:
+        self._listen()
+        if self._has_part and not self._is_begun and not self._is_over:
             self._is_begun = True
             self._expect(self._sockets.frame_deadline_s)
+
+    def _listen(self) -> None:
+        """There is no whole request: wait for more, unless nothing more will come."""
+        if self._is_eof:
+            self._close()
+        elif self._is_paused:
+            self._read_on()
 
     def _read_on(self) -> None:
         if self._is_paused:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 
-from protocol.codec import Format
+from protocol.codec import LEAST_LIMIT_BYTES, Format
 from protocol.errors import ProtocolError, TooLarge
 from server.answer import refusal
 from server.conversation import Conversation
@@ -38,10 +38,11 @@ class StreamSocket(Conversation):
         if len(buffer) < _PREFIX.size:
             return None
         (size,) = _PREFIX.unpack_from(buffer)
-        limit = self._sockets.desk.handlers.max_bytes(self._connection, Format.MSGPACK)
-        if size > limit:
-            self._refuse(TooLarge(f"the frame has {size} bytes, the limit is {limit}"))
-            return None
+        if size > LEAST_LIMIT_BYTES:
+            limit = self._sockets.desk.handlers.max_bytes(self._connection, Format.MSGPACK)
+            if size > limit:
+                self._refuse(TooLarge(f"the frame has {size} bytes, the limit is {limit}"))
+                return None
         end = _PREFIX.size + size
         if len(buffer) < end:
             return None
