@@ -65,6 +65,18 @@ class _AtOnce:
         job()
 
 
+class _Free:
+    """Looks at sockets that there are none of: every turn has its own."""
+
+    is_free = True
+
+    def take(self) -> None:
+        pass
+
+    def since_ns(self, received_ns: int) -> int:
+        return received_ns
+
+
 class _Pipe:
     """The client's socket and the server's transport in one."""
 
@@ -80,6 +92,9 @@ class _Pipe:
 
     def write(self, data: bytes) -> None:
         self._reply = data
+
+    def set_write_buffer_limits(self, high: int) -> None:
+        pass
 
     def close(self) -> None:
         pass
@@ -111,7 +126,7 @@ async def _client(bundle: Bundle, n_bots: int) -> BotClient:
     servings = Servings(n_bots)
     servings.activate(Serving(bundle, max_bots=n_bots))
     handlers = Handlers(servings, Connections(1, _PATIENCE_S), None)
-    desk = Desk(handlers, _AtOnce(), inline_us=float("inf"))
+    desk = Desk(handlers, _AtOnce(), inline_us=float("inf"), looks=_Free())
     sockets = Sockets(desk, max_sockets=1, frame_deadline_s=_PATIENCE_S, idle_ttl_s=_PATIENCE_S)
     client = BotClient("unix:///joined")
     client._transport = StreamTransport(partial(_Pipe, StreamSocket(sockets, "unix")))

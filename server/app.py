@@ -23,7 +23,6 @@ from server.catalogue import Catalogue
 from server.connections import Connections
 from server.crowd import Crowd
 from server.desk import Desk
-from server.due import Due
 from server.exchange import Exchange
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
@@ -72,7 +71,7 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             admin_token=admin_token,
             body_deadline_s=settings.frame_deadline_s,
         )
-        desk = Desk(handlers, worker, inline_us=settings.inline_us, due=Due(worker, default_us=default_us))
+        desk = Desk(handlers, worker, inline_us=settings.inline_us, default_deadline_us=default_us)
         sockets = Sockets(
             desk,
             max_sockets=settings.max_connections,

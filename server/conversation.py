@@ -59,14 +59,19 @@ class Conversation(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See asyncio.Protocol."""
-        self._transport = cast("asyncio.Transport", transport)
-        self._expect(self._sockets.frame_deadline_s)
+        self._open(transport)
         try:
             self._sockets.add(self)
         except TooManyConnections as error:
             self._sockets.desk.handlers.recorder.refused(self.name, error.code)
             self._transport.write(self._framed(refusal(error, Format.MSGPACK).body))
             self._close()
+
+    def _open(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+        # Else uvloop sends what is written in one look at the sockets only after it, when others were answered too.
+        self._transport.set_write_buffer_limits(high=0)
+        self._expect(self._sockets.frame_deadline_s)
 
     def connection_lost(self, error: Exception | None) -> None:
         """See asyncio.Protocol. The connection ends, its bots with it."""

@@ -10,7 +10,8 @@ import asyncio
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+
+from msgspec import Struct
 
 from protocol import codec
 from protocol.codec import Format
@@ -19,6 +20,7 @@ from protocol.messages import Actions, Queries, Request, RequestQueries, SubmitF
 from server.answer import Answer, Arrival, answer, refusal
 from server.due import Due
 from server.handlers import Handlers
+from server.looks import Looks
 from server.pace import Kind, Pace
 from server.worker import Worker
 
@@ -30,13 +32,35 @@ _TURNS = RequestQueries, SubmitFeatures, TakeTurn
 Answered = Answer | asyncio.Future[Answer]
 
 
+class _Asked(Struct, frozen=True):  # made anew for every request: see Arrival
+    """A request at the desk: how it is answered, and by what it is known how long that takes.
+
+    `turn` is what its pace goes by, None where it never stays on the event loop; `kind` and `size` what its whole does.
+    """
+
+    answer: Callable[[], Answer]
+    arrival: Arrival
+    form: Format
+    pace: Pace
+    kind: type[object]
+    size: int
+    turn: Kind | None = None
+
+    @property
+    def work_us(self) -> float:
+        """What it is expected to take; 0 where nothing is known."""
+        return self.pace.whole_us(self.kind, self.size)
+
+
 class Desk:
     """Answers requests of every door in the order in which they come, one at a time.
 
-    A turn is answered before `ask` returns if the worker is idle and turns like it, of the same bundle, take at most
-    `inline_us`. That is how long one client's request may hold up the event loop: one that is larger, or of a size that
-    was not met before, never does. `clock` counts ns; so does `worker_clock`, but only while its thread runs: the
-    worker also waits for the interpreter, which the event loop would not.
+    A turn is answered on the event loop if the worker is idle and turns like it, of the same bundle, take at most
+    `inline_us`: before `ask` returns, or in the line of `looks`, which gives one a turn between two looks at the
+    sockets. So that is how long requests hold up the event loop: one that is larger, or of a size that was not met
+    before, never does. `default_deadline_us` is that of a turn which names none. `clock` counts ns; so does
+    `worker_clock`, but only while its thread runs: the worker also waits for the interpreter, which the event loop
+    would not.
     """
 
     def __init__(
@@ -45,12 +69,14 @@ class Desk:
         worker: Worker,
         *,
         inline_us: float,
-        due: Due | None = None,
+        default_deadline_us: float | None = None,
+        looks: Looks | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         worker_clock: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         self.handlers = handlers
-        self.due = due or Due(worker)
+        self.looks = Looks(clock) if looks is None else looks
+        self.due = Due(self.looks, default_us=default_deadline_us, clock=clock)
         self._worker = worker
         self._inline_us = inline_us
         self._clock = clock
@@ -67,86 +93,117 @@ class Desk:
         reply_form: Format | None = None,
     ) -> Answered:
         """The answer, or the future of it. Arguments are those of `server.answer.answer`."""
-        reply_form = reply_form or form
+        reply_form, pace = reply_form or form, self.handlers.pace_of(connection_id)
         if len(body) > _MAX_INLINE_BYTES:
             arrival = self._due_by(arrival, codec.peek_deadline_us(body, form))
             job = partial(answer, self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form)
-            return self._in_time(job, arrival, (bytes, len(body)), reply_form)
+            return self._in_turn(_Asked(job, arrival, reply_form, pace, bytes, len(body)))
         try:
             request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)
         except ProtocolError:  # answered by refusing it, bots untouched
             return answer(self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form)
-        how: dict[str, Any] = {"reply_form": reply_form, "decoded_ns": time.monotonic_ns()}
-        if not isinstance(request, _TURNS):
-            return self._hop(
-                partial(answer, self.handlers, request, form, connection_id, arrival, **how), arrival, reply_form
-            )
-        arrival = self._due_by(arrival, request.deadline_us)
-        turn = type(request), len(request.bots).bit_length()
-        work = type(request), len(request.bots)
-        pace = self.handlers.pace_of(connection_id)
-        if self._worker.is_idle and pace.expected_us(turn) <= self._inline_us:
-            refused = self._refused(arrival, work, reply_form)
-            if refused is not None:
-                return refused
-            begun_ns = self._clock()
-            answered = answer(self.handlers, request, form, connection_id, arrival, **how)
-            pace.observe(turn, (self._clock() - begun_ns) / 1e3)
-            if arrival.deadline is None:
-                return answered
-            self._note(work, answered, how["decoded_ns"])
-            return self.due.kept(arrival.deadline, answered, reply_form)
-        job = partial(answer, self.handlers, request, form, connection_id, arrival, **how)
-        return self._in_time(partial(self._timed, pace, turn, job), arrival, work, reply_form)
+        decoded_ns, size, turn = time.monotonic_ns(), 0, None
+        if isinstance(request, _TURNS):
+            arrival = self._due_by(arrival, request.deadline_us)
+            size = len(request.bots)
+            turn = type(request), size.bit_length()
+        job = partial(
+            answer, self.handlers, request, form, connection_id, arrival, reply_form=reply_form, decoded_ns=decoded_ns
+        )
+        return self._in_turn(_Asked(job, arrival, reply_form, pace, type(request), size, turn))
 
     def end(self, connection_id: str) -> None:
         """End a connection whose socket has closed, after what was asked for on it."""
-        self._worker.post(partial(self.handlers.end, connection_id))
+        job = partial(self._worker.post, partial(self.handlers.end, connection_id))
+        if len(self.looks):
+            self.looks.put(job, 0.0)
+        else:
+            job()
 
     def _due_by(self, arrival: Arrival, deadline_us: float | None) -> Arrival:
         deadline = self.due.of(deadline_us, arrival.received_ns)
         return arrival if deadline is None else Arrival(arrival.transport, arrival.received_ns, deadline)
 
-    def _in_time(
-        self, job: Callable[[], Answer], arrival: Arrival, work: tuple[type[object], int], form: Format
-    ) -> Answered:
-        """Have the worker do work of this kind and size by its deadline, or refuse it where that cannot be."""
-        refused = self._refused(arrival, work, form)
+    def _in_turn(self, asked: _Asked) -> Answered:
+        """Begin at once or, behind others and where this look has had its turn, in the line; or refuse at once."""
+        if self.looks.is_free or (len(self.looks) == 0 and not self._is_quick(asked)):
+            return self._begin(asked)
+        refused = self._refused(asked, self.looks.backlog_us + self._worker.backlog_us)
         if refused is not None:
             return refused
-        answered = self._hop(partial(self._measured, work, job), arrival, form, self.due.expected_us(*work))
-        if arrival.deadline is None or isinstance(answered, Answer):
-            return answered
-        return self.due.watched(arrival.deadline, answered, form)
+        if len(self.looks) + self._worker.n_waiting >= self._worker.max_queue:
+            return self._too_many(asked)
+        outcome: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self.looks.put(partial(self._begin_for, outcome, asked), asked.work_us)
+        return outcome
 
-    def _refused(self, arrival: Arrival, work: tuple[type[object], int], form: Format) -> Answer | None:
-        if arrival.deadline is None:
-            return None
-        refused = self.due.refusal_of(arrival.deadline, self.due.expected_us(*work), form)
+    def _begin_for(self, outcome: asyncio.Future[Answer], asked: _Asked) -> None:
+        answered = self._begin(asked)
+        if isinstance(answered, Answer):
+            _settle(outcome, answered)
+        else:
+            answered.add_done_callback(lambda done: _settle(outcome, done.result()))
+
+    def _begin(self, asked: _Asked) -> Answered:
+        """Answer here, or have the worker do it by its deadline, or refuse where that cannot be."""
+        refused = self._refused(asked, self._worker.backlog_us)
         if refused is not None:
-            self.handlers.recorder.refused(arrival.transport, NotReady.code)
+            return refused
+        if self._is_quick(asked):
+            return self._answered_here(asked)
+        try:
+            answered = self._worker.run(partial(self._answered_there, asked), asked.work_us)
+        except NotReady:
+            return self._too_many(asked)
+        deadline = asked.arrival.deadline
+        return answered if deadline is None else self.due.watched(deadline, answered, asked.form)
+
+    def _is_quick(self, asked: _Asked) -> bool:
+        return asked.turn is not None and self._worker.is_idle and asked.pace.expected_us(asked.turn) <= self._inline_us
+
+    def _answered_here(self, asked: _Asked) -> Answer:
+        """On the event loop."""
+        self.looks.take()
+        deadline, begun_ns = asked.arrival.deadline, self._clock()
+        answered = asked.answer()
+        took_us = (self._clock() - begun_ns) / 1e3
+        if asked.turn is not None:
+            asked.pace.observe(asked.turn, took_us)
+        if deadline is None:
+            return answered
+        _note(asked, answered, took_us)
+        return self.due.kept(deadline, answered, asked.form)
+
+    def _answered_there(self, asked: _Asked) -> Answer:
+        """On the worker's thread."""
+        begun_ns, worker_ns = self._clock(), self._worker_clock()
+        answered = asked.answer()
+        if asked.turn is not None:
+            asked.pace.observe(asked.turn, (self._worker_clock() - worker_ns) / 1e3)
+        _note(asked, answered, (self._clock() - begun_ns) / 1e3)
+        return answered
+
+    def _refused(self, asked: _Asked, wait_us: float) -> Answer | None:
+        deadline = asked.arrival.deadline
+        if deadline is None:
+            return None
+        is_new = asked.kind is not SubmitFeatures
+        refused = self.due.refusal_of(deadline, wait_us, asked.work_us, asked.form, is_new=is_new)
+        if refused is not None:
+            self.handlers.recorder.refused(asked.arrival.transport, NotReady.code)
         return refused
 
-    def _measured(self, work: tuple[type[object], int], job: Callable[[], Answer]) -> Answer:
-        begun_ns = time.monotonic_ns()
-        answered = job()
-        self._note(work, answered, begun_ns)
-        return answered
+    def _too_many(self, asked: _Asked) -> Answer:
+        self.handlers.recorder.refused(asked.arrival.transport, NotReady.code)
+        return refusal(NotReady("too many requests are waiting already", retry_after_s=0.1), asked.form)
 
-    def _note(self, work: tuple[type[object], int], answered: Answer, begun_ns: int) -> None:
-        """How long work took that has just ended, if the network was run."""
-        if isinstance(answered.reply, Queries | Actions) and answered.reply.infer_us > 0.0:  # not shed, not refused
-            self.due.observe(*work, (time.monotonic_ns() - begun_ns) / 1e3)
 
-    def _hop(self, job: Callable[[], Answer], arrival: Arrival, form: Format, expected_us: float = 0.0) -> Answered:
-        try:
-            return self._worker.run(job, expected_us)
-        except NotReady as error:
-            self.handlers.recorder.refused(arrival.transport, error.code)
-            return refusal(error, form)
+def _note(asked: _Asked, answered: Answer, took_us: float) -> None:
+    """How long work took as a whole that has just ended, if the network was run."""
+    if isinstance(answered.reply, Queries | Actions) and answered.reply.infer_us > 0.0:  # not shed, not refused
+        asked.pace.observe_whole(asked.kind, asked.size, took_us)
 
-    def _timed(self, pace: Pace, turn: Kind, job: Callable[[], Answer]) -> Answer:
-        begun_ns = self._worker_clock()
-        answered = job()
-        pace.observe(turn, (self._worker_clock() - begun_ns) / 1e3)
-        return answered
+
+def _settle(outcome: asyncio.Future[Answer], answered: Answer) -> None:
+    if not outcome.done():  # else nobody waits any more: the client went away
+        outcome.set_result(answered)

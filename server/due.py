@@ -12,76 +12,58 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from bot_runtime.deadline import LEAVE_US, Deadline
-from bot_runtime.durations import Durations
 from protocol import codec
 from protocol.codec import Format
 from protocol.errors import NotReady
 from protocol.messages import MAX_DEADLINE_US, Actions, Queries
 from server.answer import Answer, refusal
-from server.worker import Worker
+from server.looks import Looks
 from server.written import written
 
 __all__ = ["Due"]
 
-_Kind = type[object]
-_AWAKE_NS = 500_000  # from the end of a look to the next, where the event loop did not sleep in between
+# What waits before new work may take half of what its deadline leaves: a machine that becomes slower by up to two then
+# keeps it. That costs nothing, for there is a line. A turn whose first half was answered is worth more than that.
+_NEW_SHARE = 2.0
 _TICK_US = 1000.0  # the event loop's timers count whole ms, and may be early by one
 
 
 class Due:
-    """Deadlines of requests that one worker answers. `default_us` is that of a request that names none.
+    """Deadlines of requests that are found at these looks. `default_us` is that of a request that names none.
 
     `clock` counts ns and is monotonic. Counters only grow: `n_refused` for want of time, `n_timed_out` answered by the
     event loop while the work went on, `n_late` that left late.
     """
 
     def __init__(
-        self, worker: Worker, *, default_us: float | None = None, clock: Callable[[], int] = time.monotonic_ns
+        self, looks: Looks, *, default_us: float | None = None, clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        self._worker = worker
+        self._looks = looks
         self._default_us = default_us
         self._clock = clock
-        self._took: dict[_Kind, Durations] = {}
-        self._round_ns: int | None = None  # when the first request of this look was read
-        self._since_ns = self._last_ns = self._ended_ns = 0
         self.n_refused = self.n_timed_out = self.n_late = 0
 
     def of(self, asked_us: float | None, received_ns: int) -> Deadline | None:
-        """The deadline of a request, if it has any; one that is not legal is refused by the handlers.
-
-        The event loop finds requests when it looks, and answers some before it looks again. What it finds at a look may
-        have been there since shortly after the one before, so it counts from then, unless the loop has slept since.
-        """
+        """The deadline of a request, if it has any; one that is not legal is refused by the handlers."""
         limit_us = self._default_us if asked_us is None else asked_us
         if limit_us is None or not 0.0 <= limit_us <= MAX_DEADLINE_US:
             return None
-        if self._round_ns is None:
-            self._round_ns = received_ns
-            has_slept = received_ns - self._ended_ns > _AWAKE_NS
-            self._since_ns = received_ns if has_slept else self._last_ns
-            asyncio.get_running_loop().call_soon(self._end_round)
-        return Deadline(self._since_ns, limit_us, self._clock)
+        return Deadline(self._looks.since_ns(received_ns), limit_us, self._clock)
 
-    def expected_us(self, kind: _Kind, size: int) -> float:
-        """What a request of this kind and size is expected to take, all in all; 0 where nothing is known."""
-        return self._took[kind].predicted_us(size) if kind in self._took else 0.0
-
-    def observe(self, kind: _Kind, size: int, took_us: float) -> None:
-        """One has taken so long. May be called from the worker's thread."""
-        self._took.setdefault(kind, Durations(self._clock)).observe(size, took_us)
-
-    def refusal_of(self, deadline: Deadline, expected_us: float, form: Format) -> Answer | None:
+    def refusal_of(
+        self, deadline: Deadline, wait_us: float, work_us: float, form: Format, *, is_new: bool
+    ) -> Answer | None:
         """The refusal of a request that waits for too long, if it does.
 
         That is quicker than to let its bots fall back, which would cost those that can still be served their time. A
         deadline that would not do without any waiting either is no reason: then the bots fall back.
         """
-        left_us, wait_us = deadline.left_us(), self._worker.backlog_us
-        if left_us >= wait_us + expected_us or (wait_us == 0.0 and deadline.limit_us < expected_us + LEAVE_US):
+        left_us, share = deadline.left_us(), _NEW_SHARE if is_new else 1.0
+        if left_us >= share * wait_us + work_us or (wait_us == 0.0 and deadline.limit_us < work_us + LEAVE_US):
             return None
         self.n_refused += 1
-        busy = f"the deadline leaves {left_us:.0f} us, for {wait_us:.0f} of waiting and {expected_us:.0f} of work"
-        return refusal(NotReady(busy, retry_after_s=max(wait_us, expected_us) / 1e6), form)
+        busy = f"the deadline leaves {left_us:.0f} us, for {wait_us:.0f} of waiting and {work_us:.0f} of work"
+        return refusal(NotReady(busy, retry_after_s=max(wait_us, work_us) / 1e6), form)
 
     def kept(self, deadline: Deadline, answered: Answer, form: Format) -> Answer:
         """The answer as it leaves now: one that is late says so."""
@@ -121,7 +103,3 @@ class Due:
         self.n_timed_out += 1
         reply = written(deadline.fallback, form)
         answered.set_result(self.kept(deadline, Answer(reply, codec.encode(reply, form), 200), form))
-
-    def _end_round(self) -> None:
-        if self._round_ns is not None:
-            self._last_ns, self._ended_ns, self._round_ns = self._round_ns, self._clock(), None

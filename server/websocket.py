@@ -55,8 +55,7 @@ class WebSocket(Conversation):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See asyncio.Protocol. The socket counts once its handshake has been accepted."""
-        self._transport = cast("asyncio.Transport", transport)
-        self._expect(self._sockets.frame_deadline_s)
+        self._open(transport)
 
     def connection_lost(self, error: Exception | None) -> None:
         """See Conversation."""

@@ -2,95 +2,22 @@
 
 from __future__ import annotations
 
-import asyncio
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgpack
 import pytest
 
-from bot_runtime.bundle import Bundle
-from protocol.codec import Format
-from server import desk as module
-from server.answer import Answer, Arrival, answer
-from server.connections import Connections
-from server.desk import Desk
-from server.handlers import Handlers
-from server.serving import Serving
-from server.servings import Servings
-from server.worker import Worker
 from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE
-from tests.server.serving import free_numbers
-
-BOUND_US = 500.0
-
-
-class Counter:
-    """A desk's requests one after the other, each said to take `us`, and where each was answered."""
-
-    def __init__(self, bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        servings = Servings(max_bots=8)
-        servings.activate(Serving(Bundle.load(bundle), max_bots=8))
-        self.worker = Worker(max_queue=4)
-        self.us, self._now_ns, self._frame = 10.0, 0, 0
-        self.threads: list[int] = []
-        monkeypatch.setattr(module, "answer", self._answer)
-        handlers = Handlers(servings, Connections(4, 60.0), None)
-        self.desk = Desk(handlers, self.worker, inline_us=BOUND_US, clock=self._clock, worker_clock=self._clock)
-        self.connection: str | None = None
-
-    def _clock(self) -> int:
-        return self._now_ns
-
-    async def ask(self, message: dict[str, object]) -> tuple[dict[str, object], bool]:
-        """The reply, and whether it was given on the event loop."""
-        answered = self.put(message)
-        answered = answered if isinstance(answered, Answer) else await answered
-        return msgpack.unpackb(answered.body), self.threads[-1] == threading.get_ident()
-
-    def put(self, message: dict[str, object]) -> Answer | asyncio.Future[Answer]:
-        return self.desk.ask(msgpack.packb(message), Format.MSGPACK, self.connection, Arrival.now("tcp"))
-
-    async def start(self, count: int, bundle: str | None = None) -> list[int]:
-        """Bots of a new connection, which is from now on the one that asks."""
-        self.connection = None
-        welcome, _ = await self.ask({"type": "hello", "bundle": bundle})
-        self.connection = str(welcome["connection"])
-        started, _ = await self.ask({"type": "start_bots", "count": count})
-        return list(started["bots"])
-
-    async def query(self, bots: list[int]) -> bool:
-        """Whether the next frame's query of these bots was answered on the event loop."""
-        reply, inline = await self.ask(self.request(bots))
-        assert reply["type"] == "queries", reply
-        return inline
-
-    def request(self, bots: list[int]) -> dict[str, object]:
-        self._frame += 1
-        free = free_numbers(TABLE, len(bots), self._frame).tobytes()
-        return {"type": "request_queries", "frame": self._frame, "bots": bots, "free": free}
-
-    def _answer(self, *arguments: object, **how: object) -> Answer:
-        self.threads.append(threading.get_ident())
-        self._now_ns += int(self.us * 1e3)
-        return answer(*arguments, **how)
+from tests.server.counter import Counter, run_at_desk
 
 
 @pytest.fixture
 def at_desk(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Counter], object]], None]:
-    def run(test: Callable[[Counter], object]) -> None:
-        async def main() -> None:
-            counter = Counter(bundle, monkeypatch)
-            try:
-                await test(counter)
-            finally:
-                counter.worker.close()
-
-        asyncio.run(main())
-
-    return run
+    return partial(run_at_desk, bundle, monkeypatch)
 
 
 def test_a_turn_that_is_known_to_be_quick_stays_on_the_loop(at_desk: Callable[..., None]) -> None:
@@ -168,7 +95,7 @@ def test_only_small_turns_and_refusals_are_answered_on_the_loop(at_desk: Callabl
 
 def test_a_slow_bundle_beside_a_fast_one_never_borrows_its_pace(at_desk: Callable[..., None], tmp_path: Path) -> None:
     async def test(counter: Counter) -> None:
-        slow = Serving(Bundle.load(make_bundle(tmp_path / "slow", name="slow", features=TABLE)), max_bots=8)
+        slow = counter.serving(make_bundle(tmp_path / "slow", name="slow", features=TABLE))
         counter.desk.handlers.servings.activate(slow)
         fast_bots = await counter.start(1, "tiny")
         fast = counter.connection
