@@ -44,11 +44,13 @@ _Ints = NDArray[np.int64]
 def fit_rows(wishes: Wishes, limits_N: _Floats) -> _Bools:
     """What each bot may ask for within its own limit: all, where that fits."""
     asked_NI = wishes.asked_NI
-    if np.isposinf(limits_N).all():
+    if limits_N.min(initial=np.inf) == np.inf:
         return asked_NI
-    tight = np.flatnonzero(~(wishes.us_N(asked_NI) <= limits_N) & asked_NI.any(axis=1))
+    (tight,) = (~(wishes.us_N(asked_NI) <= limits_N)).nonzero()  # a cost that is not a number does not fit either
     if tight.size == 0:
         return asked_NI
+    if tight.size == limits_N.size:
+        return _single_if_better(_greedy_rows(wishes, limits_N), wishes, limits_N)
     rows, limits_R = wishes.rows(tight), limits_N[tight]
     fitted_NI = asked_NI.copy()
     fitted_NI[tight] = _single_if_better(_greedy_rows(rows, limits_R), rows, limits_R)
@@ -77,18 +79,18 @@ def _greedy_rows(wishes: Wishes, limits_R: _Floats) -> _Bools:
     feature after the run at least.
     """
     ranked = wishes.ranked()
-    left_RW, costs_RW = ranked.asked_NW.copy(), ranked.costs_NW
+    left_RW, costs_RW = ranked.asked_NW, ranked.costs_NW
     limits_R1, spent_R1 = limits_R[:, None], wishes.calls_N[:, None]
-    taken_RW, rows_R = np.zeros_like(left_RW), np.arange(limits_R.size)
+    taken_RW, rows_R = np.zeros(left_RW.shape, np.bool_), np.arange(limits_R.size)
     for _ in range(MAX_PASSES):
         left_RW &= spent_R1 + costs_RW <= limits_R1
         if not left_RW.any():
             break
         running_RW = costs_RW * left_RW
-        np.cumsum(running_RW, axis=1, out=running_RW)
+        np.add.accumulate(running_RW, 1, None, running_RW)
         running_RW += spent_R1
         fits_RW = running_RW <= limits_R1
-        last_R = fits_RW.sum(axis=1) - 1
+        last_R = np.add.reduce(fits_RW, 1, np.int64) - 1
         spent_R1 = np.where(last_R < 0, spent_R1[:, 0], running_RW[rows_R, last_R])[:, None]
         fits_RW &= left_RW
         taken_RW |= fits_RW
@@ -98,11 +100,14 @@ def _greedy_rows(wishes: Wishes, limits_R: _Floats) -> _Bools:
 
 def _single_if_better(chosen_RI: _Bools, wishes: Wishes, limits_R: _Floats) -> _Bools:
     """The choice; or in rows where one feature that fits is worth more, that one."""
+    worth_R = wishes.worth_N(chosen_RI)
+    if (wishes.value_NI.max(axis=1, initial=0.0) <= worth_R).all():
+        return chosen_RI
     fits_RI = wishes.asked_NI & (wishes.costs_NI + wishes.calls_N[:, None] <= limits_R[:, None])
     single_RI = np.where(fits_RI, wishes.value_NI, -np.inf)
     best_R = single_RI.argmax(axis=1)
     rows_R = np.arange(best_R.size)
-    better = np.flatnonzero(single_RI[rows_R, best_R] > wishes.worth_N(chosen_RI))
+    better = np.flatnonzero(single_RI[rows_R, best_R] > worth_R)
     chosen_RI[better] = False
     chosen_RI[better, best_R[better]] = True
     return chosen_RI
