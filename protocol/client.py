@@ -6,7 +6,8 @@ package, plain dicts and numpy, on purpose not with `protocol.codec`. Shape lett
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -41,14 +42,25 @@ class BotClient:
     on; over TCP and Unix sockets the connection and its bots have ended, so say hello again.
     """
 
-    def __init__(self, url: str, *, timeout_s: float = 5.0, cafile: Path | None = None, spin_us: float = 0.0) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        timeout_s: float = 5.0,
+        cafile: Path | None = None,
+        spin_us: float = 0.0,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         """`https`, `wss` and `tcps` speak TLS; `cafile` has the authorities to trust where not those of the system.
 
         An answer is polled for during `spin_us` before the thread sleeps until it comes: for a thread with a core.
+        `clock` counts ns and is monotonic: `n_late` answers came too late by it, or left so by the server's.
         """
         self._transport = open_transport(url, timeout_s, cafile=cafile, spin_us=spin_us)
         self._packer = msgpack.Packer()  # kept, for each begins with a large buffer
         self._welcome: Welcome | None = None
+        self._clock = clock
+        self.n_late = 0
 
     def __enter__(self) -> Self:
         return self
@@ -224,8 +236,13 @@ class BotClient:
         return read_reply(body, message["type"])
 
     def _framed(self, message: dict[str, Any]) -> dict[str, Any]:
+        asked_ns = self._clock()
         reply = self.exchange(message)
         if reply.get("frame") != message["frame"]:
             self._transport.close()
             raise ReplyError(f"the reply is for frame {reply.get('frame')!r}, expected {message['frame']}")
+        deadline_us = message.get("deadline_us", self.welcome.deadline_us)
+        if deadline_us is not None and self._clock() - asked_ns > 1e3 * deadline_us:
+            reply["late"] = True  # whatever the server says, who cannot know when this was sent or came
+        self.n_late += bool(reply.get("late"))
         return reply

@@ -71,7 +71,8 @@ class Welcome(NamedTuple):
 class Queries(NamedTuple):
     """Which costly features to acquire: `queries` bool [N, M], `cost_us` float64 [N] predicted, `infer_us` spent.
 
-    `reasons` uint8 [N]: why a bot asks for nothing, 0 where that is learned. `late`: it left after its deadline.
+    `reasons` uint8 [N]: why a bot asks for nothing, 0 where that is learned. `late`: it left after its deadline,
+    or came after it by the client's own clock.
     """
 
     frame: int

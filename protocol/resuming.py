@@ -32,6 +32,7 @@ from protocol.transport import ReplyError
 __all__ = ["ResumingClient"]
 
 T = TypeVar("T")
+Half = TypeVar("Half", Queries, Actions)
 
 
 class ResumingClient:
@@ -39,7 +40,8 @@ class ResumingClient:
 
     A request without an answer is repeated for at most `limit_s` before it raises what a BotClient would have. NoBot
     is raised where bots cannot be resumed, for another bundle is served. Costs that the server learned are learned
-    again, from the `cost_model` of `hello` and the turns that are replayed. `resumed` counts how often all this was so.
+    again, from the `cost_model` of `hello` and the turns that are replayed. `resumed` counts how often all this was so,
+    `n_late` the answers that came after their deadline, resuming included.
     """
 
     def __init__(
@@ -60,7 +62,8 @@ class ResumingClient:
         self._history = History(1)
         self._names = Names()
         self._turns = Answers()
-        self.resumed = 0
+        self._clock = clock
+        self.resumed = self.n_late = 0
 
     def __enter__(self) -> Self:
         return self
@@ -137,7 +140,7 @@ class ResumingClient:
             now = self._names.handles(numbers)
             return self._client.query(now, frame, free, rewards, deadline_us=deadline_us, **limits)  # type: ignore[arg-type]
 
-        queries = self._through(ask, ask)
+        queries = self._timely(ask, ask, deadline_us)
         self._history.count(asked)
         self._turns.keep(Answered(asked, self.resumed, queries))
         return queries
@@ -165,7 +168,7 @@ class ResumingClient:
             return self._client.act(self._names.handles(numbers), frame, hidden=hidden, deadline_us=deadline_us, **said)  # type: ignore[arg-type]
 
         if turn is None or turn.asked.frame != frame:
-            return self._through(act, act)  # which the server refuses
+            return self._timely(act, act, deadline_us)  # which the server refuses
         asked = turn.asked
         now_said = {**said, **asked.limits, "hidden": hidden, "deadline_us": deadline_us}
         now_said["replayed_returns_to_go"] = asked.left_N
@@ -173,7 +176,7 @@ class ResumingClient:
         def tell() -> Actions:
             return turn.told(self._client.take(self._names.handles(numbers), frame, asked.free_NF, **now_said))
 
-        return self._answered(turn, said, self._through(act if earlier is None else tell, tell))
+        return self._answered(turn, said, self._timely(act if earlier is None else tell, tell, deadline_us))
 
     def take(
         self,
@@ -204,7 +207,7 @@ class ResumingClient:
         def take() -> Actions:
             return self._client.take(self._names.handles(numbers), frame, free, **now_said)  # type: ignore[arg-type]
 
-        actions = self._through(take, take)
+        actions = self._timely(take, take, deadline_us)
         self._history.count(asked)
         return self._answered(Answered(asked, self.resumed), said, actions)
 
@@ -231,6 +234,16 @@ class ResumingClient:
             self._history.take(turn.asked, acquired, actions.turns)
         self._turns.keep(turn._replace(resumed=self.resumed, actions=actions))
         return actions
+
+    def _timely(self, first: Callable[[], Half], again: Callable[[], Half], deadline_us: float | None) -> Half:
+        """As `_through`; `late` where all of it took longer than the deadline."""
+        asked_s = self._clock()
+        answer = self._through(first, again)
+        limit_us = self.welcome.deadline_us if deadline_us is None else deadline_us
+        if limit_us is not None and 1e6 * (self._clock() - asked_s) > limit_us:
+            answer = answer._replace(late=True)
+        self.n_late += answer.late
+        return answer
 
     def _through(self, first: Callable[[], T], again: Callable[[], T], *, repeatable: bool = True) -> T:
         """The answer to `first`, or to `again` once the bots were resumed."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 import struct
 import threading
 import tracemalloc
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import msgpack
 import numpy as np
@@ -102,6 +103,20 @@ def test_a_late_answer_is_never_taken_for_the_next_one() -> None:
         with pytest.raises(ReplyError, match="frame 7"):
             client.query(BOTS, 8, FREE)
         assert client._transport._socket is None
+
+
+def test_an_answer_that_comes_after_its_deadline_is_late_whatever_it_says() -> None:
+    ticks_ns = itertools.count(0, 1_000_000)  # a clock that is looked at every ms
+    frames = [VECTORS[name].frame for name in ("welcome", "queries", "queries", "queries")]
+    with (
+        scripted(frames) as (port, _),
+        closing(BotClient(f"tcp://127.0.0.1:{port}", clock=ticks_ns.__next__)) as client,
+    ):
+        client.hello()
+        late = [client.query(BOTS, 7, FREE, deadline_us=us).late for us in (1000.0, 999.0, None)]
+        assert late == [False, True, False]
+        assert client.n_late == 1
+        client._transport.close()
 
 
 @pytest.mark.parametrize(

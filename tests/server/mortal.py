@@ -100,9 +100,13 @@ def _told(method: Callable[..., Any], policy: Breaking) -> Callable[..., Any]:
     return told
 
 
-def resuming(mortal: Mortal) -> ResumingClient:
-    """A client of it that waits by no clock."""
-    client = ResumingClient("tcp://127.0.0.1:1", clock=lambda: 0.0, sleep=lambda pause_s: None)
+def resuming(
+    mortal: Mortal,
+    clock: Callable[[], float] = lambda: 0.0,
+    sleep: Callable[[float], object] = lambda pause_s: None,
+) -> ResumingClient:
+    """A client of it that waits by no clock, or by this one."""
+    client = ResumingClient("tcp://127.0.0.1:1", clock=clock, sleep=sleep)
     client._client._transport = mortal
     return client
 

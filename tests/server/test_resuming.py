@@ -51,6 +51,24 @@ def test_wherever_it_dies_the_episode_is_the_same(loaded: Bundle) -> None:
             assert not mortal.deaths
 
 
+def test_an_answer_that_a_death_held_up_is_late(tiny: Bundle) -> None:
+    now_s = [0.0]
+
+    def sleep(pause_s: float) -> None:
+        now_s[0] += pause_s
+
+    client = resuming(Mortal(tiny, {1: "before"}), clock=lambda: now_s[0], sleep=sleep)
+    client.hello()
+    bots, late = client.start(2, seeds=[1, 2]), []
+    for frame in range(4):
+        queries = client.query(bots, frame, free_numbers(TABLE, 2, frame), deadline_us=4e6)
+        actions = client.act(bots, frame, queries.queries, costly_numbers(TABLE, 2, frame), deadline_us=1.0)
+        late += [queries.late, actions.late]
+    assert client.resumed == 1
+    assert late == [False, True] + 6 * [False]
+    assert client.n_late == 1
+
+
 def test_turns_that_no_context_took_are_not_replayed(tiny: Bundle) -> None:
     """Whole messages that fell back, first and last ones too; then one bot's turns alone."""
     for broken in ({0: [0, 1, 2], 14: [0, 1, 2], 15: [0, 1, 2], 30: [0, 1, 2]}, {4: [1], 16: [0], 29: [2]}):
