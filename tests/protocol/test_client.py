@@ -8,7 +8,7 @@ import struct
 import threading
 import tracemalloc
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 
 import msgpack
 import numpy as np
@@ -108,10 +108,8 @@ def test_a_late_answer_is_never_taken_for_the_next_one() -> None:
 def test_an_answer_that_comes_after_its_deadline_is_late_whatever_it_says() -> None:
     ticks_ns = itertools.count(0, 1_000_000)  # a clock that is looked at every ms
     frames = [VECTORS[name].frame for name in ("welcome", "queries", "queries", "queries")]
-    with (
-        scripted(frames) as (port, _),
-        closing(BotClient(f"tcp://127.0.0.1:{port}", clock=ticks_ns.__next__)) as client,
-    ):
+    with scripted(frames) as (port, _):
+        client = BotClient(f"tcp://127.0.0.1:{port}", clock=ticks_ns.__next__)
         client.hello()
         late = [client.query(BOTS, 7, FREE, deadline_us=us).late for us in (1000.0, 999.0, None)]
         assert late == [False, True, False]
