@@ -55,7 +55,7 @@ def test_an_answer_that_a_death_held_up_is_late(tiny: Bundle) -> None:
     now_s = [0.0]
 
     def sleep(pause_s: float) -> None:
-        now_s[0] += 10.0
+        now_s[0] += 5.0
 
     client = resuming(Mortal(tiny, {1: "before"}), clock=lambda: now_s[0], sleep=sleep)
     client.hello()
