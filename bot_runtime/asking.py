@@ -54,7 +54,7 @@ class Asking:
             if deadline is None or self._haste.settle(deadline, n_bots, allowed_us, drawn.infer_us, "query_probs"):
                 queries = drawn
         assert queries is not None  # it is drawn, or there is a cause, or a deadline has passed
-        return self._turn(company, request, returns_to_go_N, queries, noise_NX, is_prepared=cause is None)
+        return self._turn(company, request, returns_to_go_N, queries, noise_NX, cause is None)
 
     def decided(
         self,
@@ -69,7 +69,7 @@ class Asking:
         noise_NX = self._contexts.noise(company.batch)
         probs_NM = np.broadcast_to(np.float32(0.0), query_NM.shape)
         queries = Queries(frame, query_NM, cost_us_N, probs_NM, 0.0)
-        turn = self._turn(company, request, returns_to_go_N, queries, noise_NX, is_prepared=False)
+        turn = self._turn(company, request, returns_to_go_N, queries, noise_NX, False)
         turn.taken = True
         return turn
 
@@ -95,7 +95,6 @@ class Asking:
         returns_to_go_N: NDArray[np.float64],
         queries: Queries,
         noise_NX: NDArray[np.float32],
-        *,
         is_prepared: bool,
     ) -> Turn:
         return Turn(

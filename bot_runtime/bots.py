@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,7 @@ class Bots(Roster):
         self._asking = Asking(bundle.manifest.features.n_queries, self._contexts, self.haste, clock)
         self._step = Step(bundle.manifest, self._contexts, self.counters, self.haste, clock)
         self._checks = inputs.FeatureChecks(bundle.manifest.features, max_bots)
+        self._request = partial(Request.checked, self._checks, self._spending)
 
     def request_queries(
         self,
@@ -198,9 +199,6 @@ class Bots(Roster):
         Not how long it waited for a processor: the probe must not fail for the load that others make. From any thread.
         """
         return self._policy.check_batch(n_bots, time.thread_time_ns)
-
-    def _request(self, company: Company, *said: Any) -> Request:
-        return Request.checked(self._checks, self._spending, company, *said)
 
     def _left(self, company: Company, request: Request, rewards: Numbers, replayed: Numbers) -> tuple[_Floats, _Floats]:
         """What each bot has left in a turn, [N], and what the message says of that: [N], empty where nothing."""

@@ -100,15 +100,11 @@ class Company:
     means: Means  # where a frame says nothing of budgets
     turn: Turn | None = None
 
-    @property
-    def slots_N(self) -> NDArray[np.int64]:
-        """Their rows of the arena, shape [N]."""
-        return self.batch.slots_N
-
-    @property
-    def n_bots(self) -> int:
-        """N."""
-        return self.batch.n_bots
+    def __post_init__(self) -> None:
+        self.slots_N = self.batch.slots_N  # their rows of the arena
+        self.n_bots = self.batch.n_bots
+        self.nothing_N = np.zeros(self.n_bots)  # what they have earned where nothing is said of that
+        self.nothing_N.setflags(write=False)
 
 
 class Companies:

@@ -46,9 +46,8 @@ class Request(Struct, frozen=True, eq=False):
         costs: Costs | None,
     ) -> Request:
         """Raises BadShape, NonFinite, OutOfRange."""
-        n_bots = company.n_bots
+        n_bots, rewards_N = company.n_bots, company.nothing_N
         checks.free(free_NF, company.handles_N)
-        rewards_N = np.zeros(n_bots)
         if rewards is not None:
             rewards_N = inputs.per_bot("rewards", rewards, n_bots, -MAX_RETURN, MAX_RETURN)
         limits, means = NOTHING_SAID, company.means

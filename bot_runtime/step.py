@@ -52,10 +52,10 @@ class Step:
 
         Raises NotReady where the deadline has passed and the request was refused. Changes nothing.
         """
+        if deadline is None and not self._haste.breaker.is_open:
+            return _ALL_TIME
         graphs = ("act",) if turn.is_prepared else ("query_probs", "act")
         cause = self._haste.cause_against(deadline, batch.n_bots, *graphs)
-        if deadline is None and cause is None:
-            return _ALL_TIME
         held = self._held(turn, batch, cause or Cause.DEADLINE)
         if deadline is None:
             return Chance(None, held, may_infer=False)

@@ -100,9 +100,9 @@ class Turns:
 
         Raises StaleFrame; FrameReused when any of these bots saw this frame in other company, or began it otherwise.
         """
-        repeats, turns = False, self._last(company)
-        for turn in turns:
-            phase, last_frame = (turn.phase, turn.frame) if turn else (Phase.IDLE, None)
+        repeats = False
+        for turn in self._last(company):
+            phase, last_frame = (turn.phase, turn.frame) if turn is not None else (Phase.IDLE, None)
             transition(phase, last_frame, event, frame)
             repeats |= is_retry(phase, last_frame, event, frame)
         if not repeats:
@@ -122,7 +122,7 @@ class Turns:
         """
         turns = self._last(company)
         for turn in turns:
-            phase, last_frame = (turn.phase, turn.frame) if turn else (Phase.IDLE, None)
+            phase, last_frame = (turn.phase, turn.frame) if turn is not None else (Phase.IDLE, None)
             transition(phase, last_frame, Event.FEATURES, frame)
         turn = turns[0]
         if turn is None or len(turns) > 1 or not _are_its_bots(company, turn):

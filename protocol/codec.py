@@ -89,7 +89,8 @@ def decode(body: bytes, form: Format, message: type[Message]) -> Message:
 
 def decode_request(body: bytes, form: Format) -> Request:
     """One request of whichever type its `type` field names; raises as `decode` does."""
-    return cast("Request", _decode(body, form, _REQUESTS[form]))
+    request: Request = _decode(body, form, _REQUESTS[form])
+    return request
 
 
 def encode(message: msgspec.Struct, form: Format) -> bytes:
