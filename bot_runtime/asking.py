@@ -18,6 +18,7 @@ from bot_runtime.fallback import Cause
 from bot_runtime.haste import Haste
 from bot_runtime.request import Request
 from bot_runtime.turns import Queries, Turn
+from bot_runtime.work import Steps
 
 __all__ = ["Asking"]
 
@@ -36,7 +37,7 @@ class Asking:
         request: Request,
         returns_to_go_N: NDArray[np.float64],
         deadline: Deadline | None = None,
-    ) -> Turn:
+    ) -> Steps[Turn]:
         """A turn whose query is drawn here, within the request's limits; of nothing where there is no time for that.
 
         Raises NotReady where the deadline has passed and the request was refused.
@@ -50,7 +51,7 @@ class Asking:
             allowed_us = deadline.left_us()
             deadline.offer(queries)
         if cause is None:
-            drawn = self._draw(policy, company, frame, request, returns_to_go_N, noise_NX)
+            drawn = yield from self._draw(policy, company, frame, request, returns_to_go_N, noise_NX)
             if deadline is None or self._haste.settle(deadline, n_bots, allowed_us, drawn.infer_us, "query_probs"):
                 queries = drawn
         assert queries is not None  # it is drawn, or there is a cause, or a deadline has passed
@@ -81,10 +82,10 @@ class Asking:
         request: Request,
         returns_to_go_N: NDArray[np.float64],
         noise_NX: NDArray[np.float32],
-    ) -> Queries:
+    ) -> Steps[Queries]:
         batch, means = company.batch, request.means
         batch.begin(request.free_NF, returns_to_go_N, means.terms.target_cost_N)
-        drawn = draw(policy, batch, frame, noise_NX, means, request.limits.frame_budget_us, self._clock)
+        drawn = yield from draw(policy, batch, frame, noise_NX, means, request.limits.frame_budget_us, self._clock)
         self._haste.observe("query_probs", company.n_bots, drawn.infer_us)
         return drawn
 

@@ -126,6 +126,25 @@ class Batch:
         np.take(self.arena.place, self.slots_N, out=self.place_N, mode="clip")
         np.take(self.arena.memory, self.slots_N, axis=2, out=self.memory, mode="clip")
 
+    def fetch(self, slots_N: _Ints, *, before_query: bool) -> None:
+        """Make this batch stand for as many bots of these slots, and its inputs what their own batches have staged."""
+        if self.copies is None:
+            return
+        self.at = self.slots_N = slots_N
+        self.fetch_past() if before_query else self.fetch_context()
+        staged = ("target_cost",) if before_query else ("acquired", "noise")
+        for name in staged:
+            np.take(getattr(self.arena, name), slots_N, axis=0, out=getattr(self.copies, name), mode="clip")
+
+    def take_outputs(self, whole: Batch, first: int, *, before_query: bool) -> None:
+        """Make the outputs of one graph those of the rows of `whole` from `first` on."""
+        rows = slice(first, first + self.n_bots)
+        names = ("probs_NM", "asked_NE") if before_query else ("action_NA", "hidden_NW")
+        for name in names:
+            getattr(self, name)[...] = getattr(whole, name)[rows]
+        if not before_query:
+            self.tokens[...] = whole.tokens[:, :, rows]
+
     def keep_acquired(self) -> None:
         """Make what was staged as acquired the bots' own, so that a retry can be compared with it."""
         if self.copies is not None:

@@ -28,7 +28,9 @@ from bot_runtime.request import NOTHING_SAID, Numbers, Request
 from bot_runtime.roster import Roster
 from bot_runtime.spent import Spent
 from bot_runtime.step import Chance, Step
+from bot_runtime.together import Together
 from bot_runtime.turns import Actions, Queries, Turn
+from bot_runtime.work import Steps, alone
 from protocol.errors import BadSchema
 from protocol.messages import MAX_RETURN_TO_GO
 from protocol.turn import Event
@@ -46,6 +48,9 @@ class Bots(Roster):
     Every refused call (any ProtocolError) leaves every bot exactly as it was. A repeated request with the same content
     gets the same reply object again and advances nothing; replies are read-only arrays. `counters` says how often
     each rung of the fallback ladder was used, `spent` what was asked for and what it really cost.
+
+    A turn is taken in steps, which `together` runs for several messages at once, each with bots of its own. Alone, they
+    are run before `request_queries`, `submit_features` or `take_turn` returns.
     """
 
     def __init__(
@@ -68,8 +73,9 @@ class Bots(Roster):
         self._step = Step(bundle.manifest, self._contexts, self.counters, self.haste, clock)
         self._checks = inputs.FeatureChecks(bundle.manifest.features, max_bots)
         self._request = partial(Request.checked, self._checks, self._spending)
+        self.together = Together(self._contexts)
 
-    def request_queries(
+    def query_steps(
         self,
         handles: _Handles,
         frame: int,
@@ -80,7 +86,7 @@ class Bots(Roster):
         target_costs_us: Numbers = None,
         costs: Costs | None = None,
         deadline: Deadline | None = None,
-    ) -> Queries:
+    ) -> Steps[Queries]:
         """What each bot asks for in this frame, within its own budget and, together, within `frame_budget_us`.
 
         `rewards_N` came since each bot's last frame and leave its return-to-go, once. `budgets_us` and
@@ -98,7 +104,7 @@ class Bots(Roster):
             retried.check_same(said.content, retried.request)
             return retried.queries
         returns_to_go_N = self._contexts.returns_to_go(company.batch) - said.rewards_N
-        turn = self._asking.ask(self._policy, company, frame, said, returns_to_go_N, deadline)
+        turn = yield from self._asking.ask(self._policy, company, frame, said, returns_to_go_N, deadline)
         self._contexts.spend(company.batch, returns_to_go_N)
         if turn.is_prepared:
             company.batch.keep_prepared()
@@ -107,7 +113,7 @@ class Bots(Roster):
         self.counters.count_queries(company.n_bots, turn.queries.reasons_N)
         return turn.queries
 
-    def submit_features(
+    def feature_steps(
         self,
         handles: _Handles,
         frame: int,
@@ -117,7 +123,7 @@ class Bots(Roster):
         acquire_us: float | None = None,
         costs: Costs | None = None,
         deadline: Deadline | None = None,
-    ) -> Actions:
+    ) -> Steps[Actions]:
         """Answer the pending query of exactly these bots, in its order, and get their actions.
 
         `costly_ND` is dense; numbers of features that were not acquired, or are marked failed, are never looked at.
@@ -138,9 +144,9 @@ class Bots(Roster):
             turn.check_same(found.content, (*self._contexts.acquired(batch), turn.measured_us))
             return turn.actions
         chance = self._step.weigh(turn, batch, deadline)
-        return self._answer(turn, batch, chance, found, costs)
+        return (yield from self._answer(turn, batch, chance, found, costs))
 
-    def take_turn(
+    def turn_steps(
         self,
         handles: _Handles,
         frame: int,
@@ -156,7 +162,7 @@ class Bots(Roster):
         costs: Costs | None = None,
         replayed_returns_to_go: Numbers = None,
         deadline: Deadline | None = None,
-    ) -> Actions:
+    ) -> Steps[Actions]:
         """Both halves at once, where the engine has decided what to acquire: what it acquired or failed is the query.
 
         The same as a query that came out so and its features. Where `replayed_returns_to_go` is given, the turn was
@@ -186,12 +192,14 @@ class Bots(Roster):
         turn.request = request
         chance = self._step.weigh(turn, batch, deadline)  # nothing is refused from here on
         np.copyto(batch.costly_ND, found.costly_ND)
-        actions = self._answer(turn, batch, chance, found, costs)
+        actions = yield from self._answer(turn, batch, chance, found, costs)
         if not replayed_N.size:
             self._contexts.spend(batch, left_N)
             self.spent.ask(cost_us_N, min(said.means.allowed_us, turn.budget_us))
         self._turns.begin(company, turn)
         return actions
+
+    request_queries, submit_features, take_turn = alone(query_steps), alone(feature_steps), alone(turn_steps)
 
     def probe(self, n_bots: int) -> float:
         """Run both graphs for so many bots, on zeros, touching none; how many µs of its time that took this thread.
@@ -210,10 +218,10 @@ class Bots(Roster):
         replayed_N = inputs.per_bot("replayed_returns_to_go", replayed, company.n_bots, -limit, limit)
         return replayed_N, replayed_N
 
-    def _answer(self, turn: Turn, batch: Batch, chance: Chance, found: Acquired, costs: Costs | None) -> Actions:
+    def _answer(self, turn: Turn, batch: Batch, chance: Chance, found: Acquired, costs: Costs | None) -> Steps[Actions]:
         """Act on what was staged as acquired and is known, and learn what acquiring cost."""
         np.copyto(batch.query_NM, found.known_NM)
-        actions = self._step.act(self._policy, turn, batch, chance)
+        actions = yield from self._step.act(self._policy, turn, batch, chance)
         turn.actions, turn.measured_us = actions, found.measured_us
         batch.keep_acquired()
         if found.measured_us.size and costs is not None:

@@ -38,11 +38,19 @@ class Contexts:
         self._returns_to_go_B = np.zeros(capacity, dtype=np.float64)
         self._last_action_BA = np.zeros((capacity, manifest.action.size), dtype=np.float32)
 
-    def batch(self, slots_N: _Ints) -> Batch:
-        """The bots of these slots, to be run together again and again until one of them is cleared."""
+    def batch(self, slots_N: _Ints, outputs: _Floats | None = None) -> Batch:
+        """The bots of these slots, to be run together again and again until one of them is cleared.
+
+        All batches share their outputs but those that are given other ones.
+        """
         count = self._manifest.features.n_queries + (self._manifest.action.size if self._manifest.samples_action else 0)
         noise = Noise(self._seeds_B[slots_N], count)
-        return Batch(self._manifest, self._rows, self._copies, self._outputs, slots_N, noise)
+        outputs = self._outputs if outputs is None else outputs
+        return Batch(self._manifest, self._rows, self._copies, outputs, slots_N, noise)
+
+    def more_outputs(self) -> _Floats:
+        """Outputs for batches that must not share those of the others."""
+        return np.empty_like(self._outputs)
 
     def begin(
         self,

@@ -16,8 +16,9 @@ from bot_runtime.batch import Batch
 from bot_runtime.company import Means
 from bot_runtime.fallback import non_finite
 from bot_runtime.turns import Queries
+from bot_runtime.work import Steps, Work
 
-__all__ = ["Asker", "draw", "finite_rows", "timed_us"]
+__all__ = ["Asker", "draw", "finite_rows"]
 
 
 class Asker(Protocol):
@@ -35,9 +36,9 @@ def draw(
     means: Means,
     frame_budget_us: float | None,
     clock: Callable[[], int],
-) -> Queries:
+) -> Steps[Queries]:
     """Run the graph over a batch whose inputs are written, sample by the first M numbers of its noise, and allocate."""
-    infer_us = timed_us(clock, asker.query_probs, batch)
+    infer_us = yield Work("query_probs", asker.query_probs, batch, clock)
     probs_NM = batch.probs_NM.copy()
     query_NM = noise_NX[:, : probs_NM.shape[1]] < probs_NM
     asks_N, reasons_N = finite_rows(probs_NM), None
@@ -57,10 +58,3 @@ def finite_rows(probs_NM: NDArray[np.float32]) -> NDArray[np.bool_] | None:
         return None
     asks_N: NDArray[np.bool_] = np.logical_and.reduce(finite_NM, axis=1)
     return asks_N
-
-
-def timed_us(clock: Callable[[], int], run: Callable[[Batch], None], batch: Batch) -> float:
-    """Run a graph; how many µs that took by a clock that counts ns."""
-    started_ns = clock()
-    run(batch)
-    return (clock() - started_ns) / 1e3

@@ -33,6 +33,7 @@ from bot_runtime.request import NOTHING_SAID, Numbers, Request
 from bot_runtime.spending import Spending
 from bot_runtime.start import Start
 from bot_runtime.turns import Queries
+from bot_runtime.work import finished
 from protocol.features import CostModel
 from protocol.messages import MAX_RETURN
 from protocol.values import check_shape
@@ -100,7 +101,7 @@ class Head:
             frame_budget_us, budgets_us, target_costs_us, costs,
         )  # fmt: skip
         self._left_N = self._contexts.returns_to_go(self._company.batch) - request.rewards_N
-        return self._asking.ask(self._acquisition, self._company, frame, request, self._left_N).queries
+        return finished(self._asking.ask(self._acquisition, self._company, frame, request, self._left_N)).queries
 
     def skip(self, rewards: Numbers = None) -> None:
         """This frame's query is asked of the server, which counts these rewards. Raises as `ask` does."""

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from bot_runtime.batch import Batch
 from bot_runtime.context import Contexts
 from bot_runtime.deadline import Deadline
-from bot_runtime.draw import finite_rows, timed_us
+from bot_runtime.draw import finite_rows
 from bot_runtime.fallback import Cause, Counters, fallback_actions, held_actions, non_finite
 from bot_runtime.haste import Haste
 from bot_runtime.manifest import Manifest
 from bot_runtime.policy import Policy
 from bot_runtime.turns import Actions, Turn
+from bot_runtime.work import Steps, Work
 
 __all__ = ["Chance", "Step"]
 
@@ -63,13 +64,13 @@ class Step:
         deadline.offer(held)
         return Chance(deadline, held, cause is None, allowed_us, graphs)
 
-    def act(self, policy: Policy, turn: Turn, batch: Batch, chance: Chance) -> Actions:
+    def act(self, policy: Policy, turn: Turn, batch: Batch, chance: Chance) -> Steps[Actions]:
         """Act on what the batch holds of the turn, then advance the contexts of those bots whose step is finite.
 
         What does not come in time advances none.
         """
         if chance.may_infer:
-            infer_us = self._infer(policy, turn, batch)
+            infer_us = yield from self._infer(policy, turn, batch)
             late = chance.deadline
             if late is None or self._haste.settle(late, batch.n_bots, chance.allowed_us, infer_us, *chance.graphs):
                 return self._learned(turn, batch, infer_us)
@@ -86,22 +87,22 @@ class Step:
         reasons_N.setflags(write=False)
         return Actions(turn.frame, action_NA, reasons_N, 0.0, contexts.turns(batch).copy())
 
-    def _infer(self, policy: Policy, turn: Turn, batch: Batch) -> float:
+    def _infer(self, policy: Policy, turn: Turn, batch: Batch) -> Steps[float]:
         """Run what the action needs, and how many µs that took."""
         prepare_us = 0.0
         if not turn.is_prepared:
-            prepare_us = self._prepare(policy, turn, batch)
+            prepare_us = yield from self._prepare(policy, turn, batch)
         batch.fetch_context()
         if self._manifest.samples_action:
             np.copyto(batch.noise_NA, turn.noise_NA)
-        act_us = timed_us(self._clock, policy.act, batch)
+        act_us = yield Work("act", policy.act, batch, self._clock)
         self._haste.observe("act", batch.n_bots, act_us)
         return prepare_us + act_us
 
-    def _prepare(self, policy: Policy, turn: Turn, batch: Batch) -> float:
+    def _prepare(self, policy: Policy, turn: Turn, batch: Batch) -> Steps[float]:
         """Run the acquisition graph of a turn whose query was not drawn, and how many µs that took."""
         batch.begin(turn.request[0], turn.left_N, turn.target_cost_N)
-        prepare_us = timed_us(self._clock, policy.query_probs, batch)
+        prepare_us = yield Work("query_probs", policy.query_probs, batch, self._clock)
         self._haste.observe("query_probs", batch.n_bots, prepare_us)
         batch.keep_prepared()
         asks_N = finite_rows(batch.probs_NM) if turn.queries.reasons_N is None else None

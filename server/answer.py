@@ -11,6 +11,7 @@ from typing import Self
 from msgspec import Struct
 
 from bot_runtime.deadline import Deadline
+from bot_runtime.work import Steps, alone
 from protocol import codec
 from protocol.codec import Format
 from protocol.errors import InternalError, ProtocolError
@@ -19,7 +20,7 @@ from server.handlers import Handlers
 from server.logs import digest, logger
 from server.recorder import Spans
 
-__all__ = ["Answer", "Arrival", "answer", "refusal"]
+__all__ = ["Answer", "Arrival", "answer", "refusal", "steps"]
 
 _log = logger(__name__)
 
@@ -46,7 +47,7 @@ class Answer(Struct, frozen=True):
     status: int
 
 
-def answer(
+def steps(
     handlers: Handlers,
     sent: bytes | Request,
     form: Format,
@@ -56,7 +57,7 @@ def answer(
     kind: type[Request] | None = None,
     reply_form: Format | None = None,
     decoded_ns: int = 0,
-) -> Answer:
+) -> Steps[Answer]:
     """Decode, handle, encode. `sent` is the body, or the request where it is decoded already; `arrival` is how it came.
 
     `kind` is the message type where the door fixes it; `reply_form` is else `form`; `decoded_ns` is when the request
@@ -71,7 +72,7 @@ def answer(
         else:
             request = codec.decode_request(sent, form) if kind is None else codec.decode(sent, form, kind)
             wait_ns, decode_ns = started_ns - arrival.received_ns, clock() - started_ns
-        reply = handlers.handle(request, connection_id, reply_form, arrival.deadline)
+        reply = yield from handlers.steps(request, connection_id, reply_form, arrival.deadline)
         handled_ns = clock()
         encoded = codec.encode(reply, reply_form)
         encoded_ns = clock()
@@ -90,6 +91,9 @@ def answer(
     if kind is Hello or isinstance(sent, Hello):
         _log.warning("hello refused", transport=arrival.transport, code=refused.code)
     return refusal(refused, reply_form)
+
+
+answer = alone(steps)
 
 
 def refusal(error: ProtocolError, form: Format) -> Answer:

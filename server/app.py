@@ -71,7 +71,13 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             admin_token=admin_token,
             body_deadline_s=settings.frame_deadline_s,
         )
-        desk = Desk(handlers, worker, inline_us=settings.inline_us, default_deadline_us=default_us)
+        desk = Desk(
+            handlers,
+            worker,
+            inline_us=settings.inline_us,
+            batch_connections=settings.batch_connections,
+            default_deadline_us=default_us,
+        )
         sockets = Sockets(
             desk,
             max_sockets=settings.max_connections,

@@ -11,17 +11,18 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from msgspec import Struct
-
+from bot_runtime.work import finished
 from protocol import codec
 from protocol.codec import Format
 from protocol.errors import NotReady, ProtocolError
 from protocol.messages import Actions, Queries, Request, RequestQueries, SubmitFeatures, TakeTurn
-from server.answer import Answer, Arrival, answer, refusal
+from server.answer import Answer, Arrival, refusal, steps
+from server.asked import Asked, companions
 from server.due import Due
 from server.handlers import Handlers
 from server.looks import Looks
-from server.pace import Kind, Pace
+from server.pace import Pace
+from server.serving import Serving
 from server.worker import Worker
 
 __all__ = ["Desk"]
@@ -30,26 +31,6 @@ _MAX_INLINE_BYTES = 16384  # decoding so much takes less than a turn
 _TURNS = RequestQueries, SubmitFeatures, TakeTurn
 
 Answered = Answer | asyncio.Future[Answer]
-
-
-class _Asked(Struct, frozen=True):  # made anew for every request: see Arrival
-    """A request at the desk: how it is answered, and by what it is known how long that takes.
-
-    `turn` is what its pace goes by, None where it never stays on the event loop; `kind` and `size` what its whole does.
-    """
-
-    answer: Callable[[], Answer]
-    arrival: Arrival
-    form: Format
-    pace: Pace
-    kind: type[object]
-    size: int
-    turn: Kind | None = None
-
-    @property
-    def work_us(self) -> float:
-        """What it is expected to take; 0 where nothing is known."""
-        return self.pace.whole_us(self.kind, self.size)
 
 
 class Desk:
@@ -61,6 +42,8 @@ class Desk:
     before, never does. `default_deadline_us` is that of a turn which names none. `clock` counts ns; so does
     `worker_clock`, but only while its thread runs: the worker also waits for the interpreter, which the event loop
     would not.
+
+    Turns that wait in the line are inferred with the first of them, those of up to `batch_connections` connections.
     """
 
     def __init__(
@@ -69,6 +52,7 @@ class Desk:
         worker: Worker,
         *,
         inline_us: float,
+        batch_connections: int = 1,
         default_deadline_us: float | None = None,
         looks: Looks | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
@@ -79,6 +63,9 @@ class Desk:
         self.due = Due(self.looks, default_us=default_deadline_us, clock=clock)
         self._worker = worker
         self._inline_us = inline_us
+        self._most = batch_connections
+        self._line: dict[asyncio.Future[Answer], Asked] = {}  # what `looks` has the jobs of
+        self._strangers = Pace()
         self._clock = clock
         self._worker_clock = worker_clock
 
@@ -93,24 +80,24 @@ class Desk:
         reply_form: Format | None = None,
     ) -> Answered:
         """The answer, or the future of it. Arguments are those of `server.answer.answer`."""
-        reply_form, pace = reply_form or form, self.handlers.pace_of(connection_id)
+        reply_form, serving = reply_form or form, self.handlers.serving_of(connection_id)
+        pace = self._strangers if serving is None else serving.pace
         if len(body) > _MAX_INLINE_BYTES:
             arrival = self._due_by(arrival, codec.peek_deadline_us(body, form))
-            job = partial(answer, self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form)
-            return self._in_turn(_Asked(job, arrival, reply_form, pace, bytes, len(body)))
+            job = partial(steps, self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form)
+            return self._in_turn(Asked(job, arrival, reply_form, connection_id, pace, bytes, len(body)))
         try:
             request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)
         except ProtocolError:  # answered by refusing it, bots untouched
-            return answer(self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form)
+            return finished(steps(self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form))
         decoded_ns, size, turn = time.monotonic_ns(), 0, None
         if isinstance(request, _TURNS):
             arrival = self._due_by(arrival, request.deadline_us)
             size = len(request.bots)
             turn = type(request), size.bit_length()
-        job = partial(
-            answer, self.handlers, request, form, connection_id, arrival, reply_form=reply_form, decoded_ns=decoded_ns
-        )
-        return self._in_turn(_Asked(job, arrival, reply_form, pace, type(request), size, turn))
+        how = partial(steps, self.handlers, request, form, connection_id, arrival)
+        begun = partial(how, reply_form=reply_form, decoded_ns=decoded_ns)
+        return self._in_turn(Asked(begun, arrival, reply_form, connection_id, pace, type(request), size, turn, serving))
 
     def end(self, connection_id: str) -> None:
         """End a connection whose socket has closed, after what was asked for on it."""
@@ -124,7 +111,7 @@ class Desk:
         deadline = self.due.of(deadline_us, arrival.received_ns)
         return arrival if deadline is None else Arrival(arrival.transport, arrival.received_ns, deadline)
 
-    def _in_turn(self, asked: _Asked) -> Answered:
+    def _in_turn(self, asked: Asked) -> Answered:
         """Begin at once or, behind others and where this look has had its turn, in the line; or refuse at once."""
         if self.looks.is_free or (len(self.looks) == 0 and not self._is_quick(asked)):
             return self._begin(asked)
@@ -134,17 +121,43 @@ class Desk:
         if len(self.looks) + self._worker.n_waiting >= self._worker.max_queue:
             return self._too_many(asked)
         outcome: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._line[outcome] = asked
         self.looks.put(partial(self._begin_for, outcome, asked), asked.work_us)
         return outcome
 
-    def _begin_for(self, outcome: asyncio.Future[Answer], asked: _Asked) -> None:
+    def _begin_for(self, outcome: asyncio.Future[Answer], asked: Asked) -> None:
+        if self._line.pop(outcome, None) is None:
+            return  # it was answered together with another
+        others = companions(asked, self._line, self._most, self._is_quick)
+        if others and asked.serving is not None:
+            self._answer_together(asked.serving, [(outcome, asked), *others])
+            return
         answered = self._begin(asked)
         if isinstance(answered, Answer):
             _settle(outcome, answered)
         else:
             answered.add_done_callback(lambda done: _settle(outcome, done.result()))
 
-    def _begin(self, asked: _Asked) -> Answered:
+    def _answer_together(self, serving: Serving, group: list[tuple[asyncio.Future[Answer], Asked]]) -> None:
+        """On the event loop; what there is no time for is refused."""
+        begun = []
+        for outcome, asked in group:
+            self._line.pop(outcome, None)
+            refused = self._refused(asked, 0.0)
+            if refused is None:
+                begun.append((outcome, asked))
+            else:
+                _settle(outcome, refused)
+        if not begun:
+            return
+        self.looks.take()
+        begun_ns = self._clock()
+        answers = serving.bots.together.finished([asked.steps() for _, asked in begun])
+        took_us = (self._clock() - begun_ns) / 1e3
+        for (outcome, asked), answered in zip(begun, answers, strict=True):
+            _settle(outcome, self._sealed(asked, answered, took_us / len(begun)))
+
+    def _begin(self, asked: Asked) -> Answered:
         """Answer here, or have the worker do it by its deadline, or refuse where that cannot be."""
         refused = self._refused(asked, self._worker.backlog_us)
         if refused is not None:
@@ -158,15 +171,19 @@ class Desk:
         deadline = asked.arrival.deadline
         return answered if deadline is None else self.due.watched(deadline, answered, asked.form)
 
-    def _is_quick(self, asked: _Asked) -> bool:
+    def _is_quick(self, asked: Asked) -> bool:
         return asked.turn is not None and self._worker.is_idle and asked.pace.expected_us(asked.turn) <= self._inline_us
 
-    def _answered_here(self, asked: _Asked) -> Answer:
+    def _answered_here(self, asked: Asked) -> Answer:
         """On the event loop."""
         self.looks.take()
-        deadline, begun_ns = asked.arrival.deadline, self._clock()
-        answered = asked.answer()
-        took_us = (self._clock() - begun_ns) / 1e3
+        begun_ns = self._clock()
+        answered = finished(asked.steps())
+        return self._sealed(asked, answered, (self._clock() - begun_ns) / 1e3)
+
+    def _sealed(self, asked: Asked, answered: Answer, took_us: float) -> Answer:
+        """An answer of the event loop as it leaves, and what is learned of how long it took."""
+        deadline = asked.arrival.deadline
         if asked.turn is not None:
             asked.pace.observe(asked.turn, took_us)
         if deadline is None:
@@ -174,16 +191,16 @@ class Desk:
         _note(asked, answered, took_us)
         return self.due.kept(deadline, answered, asked.form)
 
-    def _answered_there(self, asked: _Asked) -> Answer:
+    def _answered_there(self, asked: Asked) -> Answer:
         """On the worker's thread."""
         begun_ns, worker_ns = self._clock(), self._worker_clock()
-        answered = asked.answer()
+        answered = finished(asked.steps())
         if asked.turn is not None:
             asked.pace.observe(asked.turn, (self._worker_clock() - worker_ns) / 1e3)
         _note(asked, answered, (self._clock() - begun_ns) / 1e3)
         return answered
 
-    def _refused(self, asked: _Asked, wait_us: float) -> Answer | None:
+    def _refused(self, asked: Asked, wait_us: float) -> Answer | None:
         deadline = asked.arrival.deadline
         if deadline is None:
             return None
@@ -193,12 +210,12 @@ class Desk:
             self.handlers.recorder.refused(asked.arrival.transport, NotReady.code)
         return refused
 
-    def _too_many(self, asked: _Asked) -> Answer:
+    def _too_many(self, asked: Asked) -> Answer:
         self.handlers.recorder.refused(asked.arrival.transport, NotReady.code)
         return refusal(NotReady("too many requests are waiting already", retry_after_s=0.1), asked.form)
 
 
-def _note(asked: _Asked, answered: Answer, took_us: float) -> None:
+def _note(asked: Asked, answered: Answer, took_us: float) -> None:
     """How long work took as a whole that has just ended, if the network was run."""
     if isinstance(answered.reply, Queries | Actions) and answered.reply.infer_us > 0.0:  # not shed, not refused
         asked.pace.observe_whole(asked.kind, asked.size, took_us)

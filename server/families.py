@@ -14,6 +14,7 @@ from typing import TypeVar
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
 
+from bot_runtime.together import BOUNDS
 from server.due import Due
 from server.recorder import BATCH_BOUNDS, NS_BOUNDS, PHASES, WHOLE, Recorder
 from server.serving import Serving
@@ -23,6 +24,7 @@ __all__ = ["bundles", "deadlines", "gauge", "readiness", "requests", "sockets"]
 Labels = TypeVar("Labels", bound=tuple[str, ...])
 _SECONDS = [f"{bound / 1e9:g}" for bound in NS_BOUNDS]
 _BATCHES = [str(bound) for bound in BATCH_BOUNDS]
+_CONNECTIONS = [str(bound) for bound in BOUNDS]
 _BUNDLE = ("bundle", "version")
 _SPENT_US = {  # of `bot_runtime.spent.Spent`: the metric that it becomes, in seconds
     "allowed_us": ("budget_allowed", "What budgets would have let bots ask for, never more than everything costs."),
@@ -96,6 +98,12 @@ def bundles(servings: Iterable[Serving]) -> Iterator[Metric]:
     yield _counter("abandoned_queries", "Pending queries that a newer frame replaced.", _BUNDLE, abandoned)
     opened = {key: sum(each.bots.haste.breaker.n_opened for each in group) for key, group in by_bundle.items()}
     yield _counter("breaker_opened", "Times that a bundle was too slow too often.", _BUNDLE, opened)
+    joined = _histogram("batch_connections", "Connections whose turns were inferred as one batch.", _BUNDLE)
+    for key, group in by_bundle.items():
+        together = [each.bots.together for each in group]
+        counts = [sum(column) for column in zip(*(each.counts for each in together), strict=True)]
+        _fill(joined, list(key), _CONNECTIONS, counts, sum(each.n_batches for each in together))
+    yield joined
     for number, (name, help_text) in _SPENT_US.items():
         in_s = {key: us / 1e6 for key, us in summed(number, "spent").items()}
         yield _counter(f"{name}_seconds", help_text, _BUNDLE, in_s)

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from bot_runtime.costs import Report
 from bot_runtime.deadline import Deadline
 from bot_runtime.inputs import check_costs, per_bot
+from bot_runtime.work import Steps
 from protocol import arrays
 from protocol.codec import Format
 from protocol.errors import BadSchema
@@ -38,7 +39,6 @@ from protocol.messages import (
 )
 from server.connections import Connection, Connections
 from server.logs import digest, logger
-from server.pace import Pace
 from server.recorder import Recorder
 from server.serving import Serving
 from server.servings import Servings
@@ -70,32 +70,31 @@ class Handlers:
         self._token = token
         self._default_deadline_us = default_deadline_us
         self.recorder = Recorder()
-        self._strangers = Pace()
 
     def max_bytes(self, connection_id: str | None, form: Format) -> int:
         """The longest message that is read from this connection, or from a stranger: hello. Safe from any thread."""
         is_known = self.connections.peek(connection_id) is not None
         return (self.servings.max_body_bytes if is_known else self.servings.max_hello_bytes)[form]
 
-    def pace_of(self, connection_id: str | None) -> Pace:
-        """Of what this connection's bots are served; safe on the event loop."""
+    def serving_of(self, connection_id: str | None) -> Serving | None:
+        """What this connection's bots are served, None where it is none; safe on the event loop."""
         connection = self.connections.peek(connection_id)
-        return self._strangers if connection is None else connection.serving.pace
+        return None if connection is None else connection.serving
 
-    def handle(
+    def steps(
         self, request: Request, connection_id: str | None, form: Format, deadline: Deadline | None = None
-    ) -> Reply:
+    ) -> Steps[Reply]:
         """The reply to one request, its blobs written for `form`. Raises ProtocolError, having done nothing."""
         if isinstance(request, Hello):
             return self._hello(request, connection_id, form)
         connection = self.connections.get(connection_id)
         match request:
             case RequestQueries():
-                return self._request_queries(request, connection, form, deadline)
+                return (yield from self._request_queries(request, connection, form, deadline))
             case SubmitFeatures():
-                return self._submit_features(request, connection, form, deadline)
+                return (yield from self._submit_features(request, connection, form, deadline))
             case TakeTurn():
-                return self._take_turn(request, connection, form, deadline)
+                return (yield from self._take_turn(request, connection, form, deadline))
             case StartBots():
                 return self._start_bots(request, connection)
             case StopBots():
@@ -167,13 +166,13 @@ class Handlers:
 
     def _request_queries(
         self, request: RequestQueries, connection: Connection, form: Format, deadline: Deadline | None
-    ) -> Queries | Actions:
+    ) -> Steps[Queries | Actions]:
         connection.check_owns(request.bots)
         _check_deadline(request.deadline_us)
         serving = connection.serving
         free_NF = arrays.floats(request.free, (len(request.bots), serving.table.n_free), "free")
         handles_N = np.array(request.bots, dtype=np.int64)
-        turn = serving.bots.request_queries(
+        turn = yield from serving.bots.query_steps(
             handles_N,
             request.frame,
             free_NF,
@@ -188,7 +187,7 @@ class Handlers:
 
     def _submit_features(
         self, request: SubmitFeatures, connection: Connection, form: Format, deadline: Deadline | None
-    ) -> Queries | Actions:
+    ) -> Steps[Queries | Actions]:
         connection.check_owns(request.bots)
         _check_deadline(request.deadline_us)
         serving = connection.serving
@@ -197,20 +196,20 @@ class Handlers:
         failed_NM = None if request.failed is None else arrays.bits(request.failed, shape, "failed")
         costly_ND = arrays.unpack_values(request.values, acquired_NM, serving.table)
         handles_N = np.array(request.bots, dtype=np.int64)
-        turn = serving.bots.submit_features(
+        turn = yield from serving.bots.feature_steps(
             handles_N, request.frame, acquired_NM, costly_ND, failed_NM, request.acquire_us, connection.costs, deadline
         )
         return written(turn, form, serving.bots.hidden(handles_N) if request.hidden else None)
 
     def _take_turn(
         self, request: TakeTurn, connection: Connection, form: Format, deadline: Deadline | None
-    ) -> Queries | Actions:
+    ) -> Steps[Queries | Actions]:
         connection.check_owns(request.bots)
         _check_deadline(request.deadline_us)
         serving, n_bots = connection.serving, len(request.bots)
         acquired_NM = arrays.bits(request.acquired, (n_bots, serving.table.n_queries), "acquired")
         handles_N = np.array(request.bots, dtype=np.int64)
-        turn = serving.bots.take_turn(
+        turn = yield from serving.bots.turn_steps(
             handles_N,
             request.frame,
             arrays.floats(request.free, (n_bots, serving.table.n_free), "free"),

@@ -57,6 +57,10 @@ class Settings:
     spin_us: float = 0.0
     """After each answer the event loop polls for so long before it sleeps, so that the next request of the same turn
     need not wake it. For a server with a core of its own: another process on that core would wait meanwhile."""
+    batch_connections: int = 1
+    """Turns of at most so many connections are inferred as one batch, where they are found ready together, have 8 bots
+    at most and are quick enough for the event loop. 1: each alone. Whether a bot's numbers are the same to the last bit
+    then depends on who asked at the same time, for some bundles."""
     idle_ttl_s: float = 60.0
     """A connection that is silent for this long ends, and its bots with it."""
     frame_deadline_s: float = 3.0
@@ -105,6 +109,8 @@ class Settings:
             raise ValueError("inline_us must not be negative")
         if not 0 <= self.spin_us <= MAX_SPIN_US:
             raise ValueError(f"spin_us is {self.spin_us}, expected 0 to {MAX_SPIN_US:g}")
+        if not 1 <= self.batch_connections <= 64:
+            raise ValueError("batch_connections must be 1 to 64")
         if self.process is not None and not _PROCESS.fullmatch(self.process):
             raise ValueError(f"process {self.process[:80]!r} does not match {_PROCESS.pattern}")
         if self.default_deadline_us is not None and not 0 < self.default_deadline_us <= MAX_DEADLINE_US:

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from bot_runtime.bots import Bots
+from bot_runtime.turns import Queries
+from bot_runtime.work import Steps
 from protocol.errors import OutOfRange
 from tests.fuzz.campaign import mutate
 from tests.fuzz.mutation import changed_bytes, changed_json, changed_msgpack
@@ -39,16 +41,16 @@ def test_any_bytes_keep_every_promise(name: str, tmp_path: Path) -> None:
 def test_a_request_that_changes_something_and_is_then_refused_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    request_queries = Bots.request_queries
+    query_steps = Bots.query_steps
 
-    def stops_what_it_refuses(self: Bots, handles: np.ndarray, *rest: object) -> object:
+    def stops_what_it_refuses(self: Bots, handles: np.ndarray, *rest: object) -> Steps[Queries]:
         try:
-            return request_queries(self, handles, *rest)
+            return (yield from query_steps(self, handles, *rest))
         except OutOfRange:
             self.stop(handles)
             raise
 
-    monkeypatch.setattr(Bots, "request_queries", stops_what_it_refuses)
+    monkeypatch.setattr(Bots, "query_steps", stops_what_it_refuses)
     with pytest.raises(AssertionError, match="refused"):
         mutate(TurnTarget(tmp_path), 0, 2_000, _NO_LIMIT_S)
 

@@ -11,9 +11,10 @@ import msgpack
 import pytest
 
 from bot_runtime.bundle import Bundle
+from bot_runtime.work import Steps
 from protocol.codec import Format
 from server import desk as module
-from server.answer import Answer, Arrival, answer
+from server.answer import Answer, Arrival, steps
 from server.connections import Connections
 from server.desk import Desk
 from server.handlers import Handlers
@@ -38,7 +39,7 @@ class Counter:
         servings.activate(self.serving(bundle))
         self.worker = Worker(max_queue=4)
         self.threads: list[int] = []
-        monkeypatch.setattr(module, "answer", self._answer)
+        monkeypatch.setattr(module, "steps", self._steps)
         handlers = Handlers(servings, Connections(4, 60.0), None)
         self.desk = Desk(handlers, self.worker, inline_us=BOUND_US, clock=self._clock, worker_clock=self._clock)
         self.connection: str | None = None
@@ -92,10 +93,10 @@ class Counter:
     def advance_us(self, us: float) -> None:
         self._now_ns += int(us * 1e3)
 
-    def _answer(self, *arguments: object, **how: object) -> Answer:
+    def _steps(self, *arguments: object, **how: object) -> Steps[Answer]:
         self.threads.append(threading.get_ident())
         self._now_ns += int(self.us * 1e3)
-        return answer(*arguments, **how)
+        return (yield from steps(*arguments, **how))
 
 
 def run_at_desk(bundle: Path, monkeypatch: pytest.MonkeyPatch, test: Callable[[Counter], object]) -> None:

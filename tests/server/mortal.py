@@ -73,7 +73,7 @@ class Mortal:
         servings.activate(serving)
         bots = serving.bots
         bots._policy = Breaking(bots._policy, self._broken)
-        for name in ("submit_features", "take_turn"):
+        for name in ("feature_steps", "turn_steps"):
             setattr(bots, name, _told(getattr(bots, name), bots._policy))
         return Handlers(servings, Connections(8, 1e9), None)
 

@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 
+from bot_runtime.work import Steps
 from protocol.client import BotClient
 from protocol.codec import MAX_DETAIL_CHARS, Format
 from protocol.errors import TooManyBots
 from server import desk
-from server.answer import Answer, Arrival, answer, refusal
+from server.answer import Answer, Arrival, answer, refusal, steps
 from server.recorder import Recorder
 from tests.server.serving import Served
 
@@ -25,7 +26,7 @@ def _failing(*_: object) -> None:
 
 def test_a_failure_is_internal_and_its_traceback_stays_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
     recorder = Recorder()
-    handlers = SimpleNamespace(handle=_failing, recorder=recorder)
+    handlers = SimpleNamespace(steps=_failing, recorder=recorder)
     with caplog.at_level(logging.ERROR):
         answered = answer(handlers, b'{"type":"goodbye"}', Format.JSON, None, Arrival.now("tcp"))
     assert (answered.status, json.loads(answered.body)["code"]) == (500, "INTERNAL")
@@ -48,11 +49,11 @@ def test_every_request_says_by_which_door_and_when_it_came(
 
     def noted(
         handlers: object, body: bytes, form: Format, connection: str | None, arrival: Arrival, **how: Any
-    ) -> Answer:
+    ) -> Steps[Answer]:
         arrivals.append(arrival)
-        return answer(handlers, body, form, connection, arrival, **how)
+        return (yield from steps(handlers, body, form, connection, arrival, **how))
 
-    monkeypatch.setattr(desk, "answer", noted)
+    monkeypatch.setattr(desk, "steps", noted)
     begun_ns = time.monotonic_ns()
     with BotClient(served.addresses[door]) as client:
         client.hello()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bot_runtime.bundle import Bundle
+from bot_runtime.work import finished
 from protocol.client import BotClient
 from protocol.codec import Format
 from protocol.errors import BadShape, FrameReused
@@ -32,7 +33,7 @@ def test_without_a_limit_the_budget_is_what_everything_costs_on_this_connection(
     handlers = Handlers(servings, Connections(2, 1.0), None)
     model = CostModel(1000.0, (3.0,) * manifest.features.n_queries)
     for hello, full_us in ((Hello(cost_model=model), model.full_us), (Hello(), manifest.budget_us)):
-        assert handlers.handle(hello, None, Format.MSGPACK).budget_us == full_us
+        assert finished(handlers.steps(hello, None, Format.MSGPACK)).budget_us == full_us
 
 
 @pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from bot_runtime.work import Steps
 from server import desk
-from server.answer import Answer, answer
+from server.answer import Answer, steps
 from server.sockets import Sockets
 from tests.protocol.golden import VECTORS
 from tests.server.serving import RawStream, http_request, serve
@@ -21,12 +22,12 @@ class Gate:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.reached, self.opened = threading.Event(), threading.Event()
-        monkeypatch.setattr(desk, "answer", self._answer)
+        monkeypatch.setattr(desk, "steps", self._steps)
 
-    def _answer(self, *arguments: object, **how: object) -> Answer:
+    def _steps(self, *arguments: object, **how: object) -> Steps[Answer]:
         self.reached.set()
         self.opened.wait()
-        return answer(*arguments, **how)
+        return (yield from steps(*arguments, **how))
 
 
 def test_a_full_queue_refuses_at_once_at_every_door(

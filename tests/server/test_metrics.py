@@ -69,6 +69,7 @@ def test_what_happened_is_what_it_says(server: Served, door: str) -> None:
         assert scrape("queries_total", reason="learned") == 6 * N
         assert scrape("deadlines_missed_total", outcome="late") == 0
         assert scrape("breaker_opened_total", bundle="tiny") == 0
+        assert scrape("batch_connections_count", bundle="tiny") == 0
         assert scrape("refused_total", transport=door, code="NO_BOT") == 1
         assert scrape("skipped_frames_total") == N * (3 + 1)
         assert scrape("abandoned_queries_total") == N

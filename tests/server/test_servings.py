@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bot_runtime.bundle import Bundle
+from bot_runtime.work import finished
 from protocol.codec import Format
 from protocol.errors import NoBundle, TooManyBots
 from protocol.messages import Goodbye, Hello, RequestQueries, StartBots, StopBots
@@ -38,28 +39,28 @@ def _served(*bundles: Bundle, max_bots: int = 8, clock: FakeClock | None = None)
 def test_a_new_connection_gets_the_active_one_and_an_old_one_keeps_its_own(versions: list[Bundle]) -> None:
     handlers, servings = _served(versions[0])
     old = servings.named(None)
-    first = handlers.handle(Hello(), None, FORM).connection
-    bots = handlers.handle(StartBots(2, seeds=[1, 2]), first, FORM).bots
+    first = finished(handlers.steps(Hello(), None, FORM)).connection
+    bots = finished(handlers.steps(StartBots(2, seeds=[1, 2]), first, FORM)).bots
     new = Serving(versions[1], max_bots=8)
     servings.activate(new)
     assert servings.named(None) is new
     assert set(servings) == {old, new}
-    second = handlers.handle(Hello(), None, FORM).connection
-    handlers.handle(StartBots(1), second, FORM)
+    second = finished(handlers.steps(Hello(), None, FORM)).connection
+    finished(handlers.steps(StartBots(1), second, FORM))
     assert (old.bots.n_bots, new.bots.n_bots, servings.n_bots) == (2, 1, 3)
     free = np.zeros((2, old.table.n_free), dtype="<f4").tobytes()
-    handlers.handle(RequestQueries(0, bots, free), first, FORM)
-    handlers.handle(StopBots(bots), first, FORM)
+    finished(handlers.steps(RequestQueries(0, bots, free), first, FORM))
+    finished(handlers.steps(StopBots(bots), first, FORM))
     assert set(servings) == {old, new}
-    handlers.handle(Goodbye(), first, FORM)
+    finished(handlers.steps(Goodbye(), first, FORM))
     assert set(servings) == {new}
 
 
 def test_an_old_one_is_forgotten_with_its_last_connection_however_that_ends(versions: list[Bundle]) -> None:
     clock = FakeClock()
     handlers, servings = _served(versions[0], clock=clock)
-    silent, closed = (handlers.handle(Hello(), None, FORM).connection for _ in range(2))
-    handlers.handle(StartBots(3), silent, FORM)
+    silent, closed = (finished(handlers.steps(Hello(), None, FORM)).connection for _ in range(2))
+    finished(handlers.steps(StartBots(3), silent, FORM))
     servings.activate(Serving(versions[1], max_bots=8))
     handlers.end(closed)
     handlers.end(closed)
@@ -78,7 +79,7 @@ def test_one_that_nobody_holds_is_forgotten_when_it_is_replaced(versions: list[B
 def test_one_that_is_still_held_becomes_active_again(versions: list[Bundle]) -> None:
     handlers, servings = _served(versions[0])
     first, second = servings.named(None), Serving(versions[1], max_bots=8)
-    connection = handlers.handle(Hello(), None, FORM).connection
+    connection = finished(handlers.steps(Hello(), None, FORM)).connection
     servings.activate(second)
     servings.activate(first)
     assert list(servings) == [first]
@@ -89,15 +90,15 @@ def test_one_that_is_still_held_becomes_active_again(versions: list[Bundle]) -> 
 
 def test_max_bots_counts_the_bots_of_all_of_them(versions: list[Bundle]) -> None:
     handlers, servings = _served(versions[0], max_bots=3)
-    first = handlers.handle(Hello(), None, FORM).connection
-    handlers.handle(StartBots(2), first, FORM)
+    first = finished(handlers.steps(Hello(), None, FORM)).connection
+    finished(handlers.steps(StartBots(2), first, FORM))
     servings.activate(Serving(versions[1], max_bots=3))
-    second = handlers.handle(Hello(), None, FORM).connection
+    second = finished(handlers.steps(Hello(), None, FORM)).connection
     with pytest.raises(TooManyBots, match="2 bots do not fit: 2 of 3"):
-        handlers.handle(StartBots(2), second, FORM)
-    handlers.handle(StartBots(1), second, FORM)
+        finished(handlers.steps(StartBots(2), second, FORM))
+    finished(handlers.steps(StartBots(1), second, FORM))
     with pytest.raises(TooManyBots):
-        handlers.handle(StartBots(1), first, FORM)
+        finished(handlers.steps(StartBots(1), first, FORM))
 
 
 def test_the_longest_message_is_that_of_whatever_is_in_memory(versions: list[Bundle], serving: Serving) -> None:
@@ -113,19 +114,19 @@ def test_a_connection_without_bots_starts_the_next_ones_on_the_active_version(ve
     servings = Servings(8)
     servings.activate(Serving(versions[0], max_bots=8, version=1))
     handlers = Handlers(servings, Connections(4, 60.0, FakeClock()), None)
-    hello = handlers.handle(Hello(bundle="tiny"), None, FORM)
-    pinned = handlers.handle(Hello(bundle="tiny@1"), None, FORM).connection
+    hello = finished(handlers.steps(Hello(bundle="tiny"), None, FORM))
+    pinned = finished(handlers.steps(Hello(bundle="tiny@1"), None, FORM)).connection
     assert (hello.bundle_version, hello.bundle_sha256) == (1, versions[0].sha256)
-    bots = handlers.handle(StartBots(2), hello.connection, FORM).bots
+    bots = finished(handlers.steps(StartBots(2), hello.connection, FORM)).bots
     servings.activate(Serving(versions[1], max_bots=8, version=2))
-    beside = handlers.handle(StartBots(1), hello.connection, FORM)
+    beside = finished(handlers.steps(StartBots(1), hello.connection, FORM))
     assert beside.bundle_version == 1
-    handlers.handle(StopBots([*bots, *beside.bots]), hello.connection, FORM)
+    finished(handlers.steps(StopBots([*bots, *beside.bots]), hello.connection, FORM))
     with pytest.raises(TooManyBots):
-        handlers.handle(StartBots(9), hello.connection, FORM)
-    started = handlers.handle(StartBots(2), hello.connection, FORM)
+        finished(handlers.steps(StartBots(9), hello.connection, FORM))
+    started = finished(handlers.steps(StartBots(2), hello.connection, FORM))
     assert (started.bundle_version, started.bundle_sha256) == (2, versions[1].sha256)
-    assert handlers.handle(StartBots(1), pinned, FORM).bundle_version == 1
+    assert finished(handlers.steps(StartBots(1), pinned, FORM)).bundle_version == 1
     handlers.end(pinned)
     assert [serving.version for serving in servings] == [2]
 
@@ -137,10 +138,10 @@ def test_a_version_that_breaks_what_welcome_said_is_for_new_connections_only(tmp
         made = Bundle.load(make_bundle(tmp_path / str(version), budget=budget))
         if version == 2:
             handlers = Handlers(servings, Connections(4, 60.0, FakeClock()), None)
-            old = handlers.handle(Hello(), None, FORM)
+            old = finished(handlers.steps(Hello(), None, FORM))
         servings.activate(Serving(made, max_bots=8, version=version))
-    assert handlers.handle(StartBots(1), old.connection, FORM).bundle_version == 1
-    assert handlers.handle(Hello(), None, FORM).bundle_version == 2
+    assert finished(handlers.steps(StartBots(1), old.connection, FORM)).bundle_version == 1
+    assert finished(handlers.steps(Hello(), None, FORM)).bundle_version == 2
 
 
 def test_bundles_are_found_by_name_and_by_version_in_memory(versions: list[Bundle], tmp_path: Path) -> None:
