@@ -115,7 +115,7 @@ class Desk:
         """Begin at once or, behind others and where this look has had its turn, in the line; or refuse at once."""
         if self.looks.is_free or (len(self.looks) == 0 and not self._is_quick(asked)):
             return self._begin(asked)
-        refused = self._refused(asked, self.looks.backlog_us + self._worker.backlog_us)
+        refused = self._refused(asked, self.looks.backlog_us)
         if refused is not None:
             return refused
         if len(self.looks) + self._worker.n_waiting >= self._worker.max_queue:
@@ -159,7 +159,7 @@ class Desk:
 
     def _begin(self, asked: Asked) -> Answered:
         """Answer here, or have the worker do it by its deadline, or refuse where that cannot be."""
-        refused = self._refused(asked, self._worker.backlog_us)
+        refused = self._refused(asked, 0.0)
         if refused is not None:
             return refused
         if self._is_quick(asked):
@@ -200,10 +200,12 @@ class Desk:
         _note(asked, answered, (self._clock() - begun_ns) / 1e3)
         return answered
 
-    def _refused(self, asked: Asked, wait_us: float) -> Answer | None:
+    def _refused(self, asked: Asked, line_us: float) -> Answer | None:
+        """The refusal of what would wait in the line for so long, and then for the worker, for longer than it may."""
         deadline = asked.arrival.deadline
         if deadline is None:
             return None
+        wait_us = line_us + self._worker.backlog_us
         is_new = asked.kind is not SubmitFeatures
         refused = self.due.refusal_of(deadline, wait_us, asked.work_us, asked.form, is_new=is_new)
         if refused is not None:
