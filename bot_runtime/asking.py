@@ -18,7 +18,7 @@ from bot_runtime.fallback import Cause
 from bot_runtime.haste import Haste
 from bot_runtime.request import Request
 from bot_runtime.turns import Queries, Turn
-from bot_runtime.work import Steps
+from bot_runtime.work import Steps, Work
 
 __all__ = ["Asking"]
 
@@ -51,8 +51,12 @@ class Asking:
             allowed_us = deadline.left_us()
             deadline.offer(queries)
         if cause is None:
-            drawn = yield from self._draw(policy, company, frame, request, returns_to_go_N, noise_NX)
-            if deadline is None or self._haste.settle(deadline, n_bots, allowed_us, drawn.infer_us, "query_probs"):
+            batch, means = company.batch, request.means
+            batch.begin(request.free_NF, returns_to_go_N, means.terms.target_cost_N)
+            infer_us = yield Work("query_probs", policy.query_probs, batch, self._clock)
+            self._haste.observe("query_probs", n_bots, infer_us)
+            drawn = draw(batch, frame, noise_NX, means, request.limits.frame_budget_us, infer_us)
+            if deadline is None or self._haste.settle(deadline, n_bots, allowed_us, infer_us, "query_probs"):
                 queries = drawn
         assert queries is not None  # it is drawn, or there is a cause, or a deadline has passed
         return self._turn(company, request, returns_to_go_N, queries, noise_NX, cause is None)
@@ -73,21 +77,6 @@ class Asking:
         turn = self._turn(company, request, returns_to_go_N, queries, noise_NX, False)
         turn.taken = True
         return turn
-
-    def _draw(
-        self,
-        policy: Asker,
-        company: Company,
-        frame: int,
-        request: Request,
-        returns_to_go_N: NDArray[np.float64],
-        noise_NX: NDArray[np.float32],
-    ) -> Steps[Queries]:
-        batch, means = company.batch, request.means
-        batch.begin(request.free_NF, returns_to_go_N, means.terms.target_cost_N)
-        drawn = yield from draw(policy, batch, frame, noise_NX, means, request.limits.frame_budget_us, self._clock)
-        self._haste.observe("query_probs", company.n_bots, drawn.infer_us)
-        return drawn
 
     def _turn(
         self,

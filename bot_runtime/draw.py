@@ -6,7 +6,6 @@ function, so that they ask the same questions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -16,7 +15,6 @@ from bot_runtime.batch import Batch
 from bot_runtime.company import Means
 from bot_runtime.fallback import non_finite
 from bot_runtime.turns import Queries
-from bot_runtime.work import Steps, Work
 
 __all__ = ["Asker", "draw", "finite_rows"]
 
@@ -29,16 +27,14 @@ class Asker(Protocol):
 
 
 def draw(
-    asker: Asker,
     batch: Batch,
     frame: int,
     noise_NX: NDArray[np.float32],
     means: Means,
     frame_budget_us: float | None,
-    clock: Callable[[], int],
-) -> Steps[Queries]:
-    """Run the graph over a batch whose inputs are written, sample by the first M numbers of its noise, and allocate."""
-    infer_us = yield Work("query_probs", asker.query_probs, batch, clock)
+    infer_us: float,
+) -> Queries:
+    """Of a batch that the graph was run over: sample by the first M numbers of its noise, and allocate."""
     probs_NM = batch.probs_NM.copy()
     query_NM = noise_NX[:, : probs_NM.shape[1]] < probs_NM
     asks_N, reasons_N = finite_rows(probs_NM), None

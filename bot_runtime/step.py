@@ -70,7 +70,13 @@ class Step:
         What does not come in time advances none.
         """
         if chance.may_infer:
-            infer_us = yield from self._infer(policy, turn, batch)
+            infer_us = 0.0 if turn.is_prepared else (yield from self._prepare(policy, turn, batch))
+            batch.fetch_context()
+            if self._manifest.samples_action:
+                np.copyto(batch.noise_NA, turn.noise_NA)
+            act_us = yield Work("act", policy.act, batch, self._clock)
+            self._haste.observe("act", batch.n_bots, act_us)
+            infer_us += act_us
             late = chance.deadline
             if late is None or self._haste.settle(late, batch.n_bots, chance.allowed_us, infer_us, *chance.graphs):
                 return self._learned(turn, batch, infer_us)
@@ -86,18 +92,6 @@ class Step:
         action_NA.setflags(write=False)
         reasons_N.setflags(write=False)
         return Actions(turn.frame, action_NA, reasons_N, 0.0, contexts.turns(batch).copy())
-
-    def _infer(self, policy: Policy, turn: Turn, batch: Batch) -> Steps[float]:
-        """Run what the action needs, and how many µs that took."""
-        prepare_us = 0.0
-        if not turn.is_prepared:
-            prepare_us = yield from self._prepare(policy, turn, batch)
-        batch.fetch_context()
-        if self._manifest.samples_action:
-            np.copyto(batch.noise_NA, turn.noise_NA)
-        act_us = yield Work("act", policy.act, batch, self._clock)
-        self._haste.observe("act", batch.n_bots, act_us)
-        return prepare_us + act_us
 
     def _prepare(self, policy: Policy, turn: Turn, batch: Batch) -> Steps[float]:
         """Run the acquisition graph of a turn whose query was not drawn, and how many µs that took."""
