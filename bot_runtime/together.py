@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from bot_runtime.batch import Batch
@@ -83,7 +84,7 @@ class Together:
         before_query, whole = graph == "query_probs", self._whole(slots_N)
         whole.fetch(slots_N, before_query=before_query)
         try:
-            us = ordered[0].work._replace(batch=whole).done_us()
+            us = replace(ordered[0].work, batch=whole).done_us()
         except Exception as error:  # each fails as it would have alone
             for each in ready:
                 yield each, partial(each.steps.throw, error)

@@ -5,6 +5,7 @@ This module knows nothing about what travels on it.
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import ssl
@@ -56,7 +57,7 @@ class _Awake:
     def recv(self, size: int, /) -> bytes:
         until_ns = time.perf_counter_ns() + self._spin_ns
         while not self._poll(0) and time.perf_counter_ns() < until_ns:
-            pass
+            os.sched_yield()  # to the server, where it has no other core
         return self._recv(size)
 
 

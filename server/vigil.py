@@ -7,6 +7,7 @@ have used meanwhile, longer than a small turn takes; a server with a core of its
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from collections.abc import Callable
 
@@ -35,4 +36,5 @@ class Vigil:
         """A round of the event loop that has something to do does not sleep before the next."""
         self._is_awake = self._clock() < self._until_ns
         if self._is_awake:
+            os.sched_yield()  # to a client that has no other core
             asyncio.get_running_loop().call_soon(self._watch)
