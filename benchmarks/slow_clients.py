@@ -6,10 +6,13 @@ it slows nobody by sharing theirs.
 
 from __future__ import annotations
 
+import selectors
 import socket
 import struct
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -41,43 +44,48 @@ class _Slow:
     """One socket and what it sends: `first` at once, then a byte a second, or `again` as often as it is taken."""
 
     def __init__(self, kind: str, connected: socket.socket, first: bytes, rest: bytes, again: bytes) -> None:
-        self.kind, self._socket = kind, connected
+        self.kind, self.socket = kind, connected
+        self.is_reader = bool(again)
         self._rest, self._again, self._unsent = rest, again, b""
-        self._since_s = self._byte_at_s = time.monotonic()
+        self._since_s = time.monotonic()
         self.open_s: float | None = None
         connected.setblocking(False)
         if first:
             connected.send(first)
 
-    def tick(self) -> None:
-        """Go on, slowly; notices when the server has closed."""
-        now_s = time.monotonic()
+    def send_byte(self) -> bool:
+        """The next byte; whether there will be more."""
+        if self.open_s is not None or not self._rest:
+            return False
+        with self._until_closed():
+            self.socket.send(self._rest[:1])
+            self._rest = self._rest[1:]
+        return self.open_s is None and bool(self._rest)
+
+    def receive(self) -> None:
+        """Something has come: a last word, or the end."""
+        with self._until_closed():
+            while self.socket.recv(65536):
+                pass
+            raise ConnectionResetError
+
+    def send_again(self) -> None:
+        """Ask until nothing more is taken, without flooding; from then on it is the server that waits."""
+        with self._until_closed():
+            for _ in range(_ASKED_A_TICK):
+                self._unsent = self._unsent or self._again
+                self._unsent = self._unsent[self.socket.send(self._unsent) :]
+                self._since_s = time.monotonic()
+
+    @contextmanager
+    def _until_closed(self) -> Iterator[None]:
+        """Notices when the server has closed."""
         try:
-            if self._again:
-                self._send_again(now_s)
-            else:
-                if self._rest and now_s >= self._byte_at_s + _BYTE_EVERY_S:
-                    self._socket.send(self._rest[:1])
-                    self._rest, self._byte_at_s = self._rest[1:], now_s
-                while self._socket.recv(65536):
-                    pass  # a last word before it closes
-                raise ConnectionResetError
+            yield
         except BlockingIOError:
             return
         except OSError:
-            self.open_s = now_s - self._since_s
-            self._socket.close()
-
-    def _send_again(self, now_s: float) -> None:
-        """Ask until nothing more is taken, without flooding; from then on it is the server that waits."""
-        for _ in range(_ASKED_A_TICK):
-            self._unsent = self._unsent or self._again
-            self._unsent = self._unsent[self._socket.send(self._unsent) :]
-            self._since_s = now_s
-
-    def close(self) -> None:
-        """Give up waiting."""
-        self._socket.close()
+            self.open_s = self.open_s or time.monotonic() - self._since_s
 
 
 def hold(address: str, count: int, wait_s: float) -> list[Held]:
@@ -86,15 +94,34 @@ def hold(address: str, count: int, wait_s: float) -> list[Held]:
     kinds += [KINDS[index % 3] for index in range(count - len(kinds))]
     opened = _OPENED[urlsplit(address).scheme]
     slow = [opened[kind](address) for kind in kinds]
-    end_s = time.monotonic() + wait_s
-    while time.monotonic() < end_s and any(each.open_s is None for each in slow):
-        for each in slow:
-            if each.open_s is None:
-                each.tick()
-        time.sleep(_TICK_S)
+    _wait(slow, time.monotonic() + wait_s)
     for each in slow:
-        each.close()
+        each.socket.close()
     return [Held(each.kind, each.open_s) for each in slow]
+
+
+def _wait(slow: list[_Slow], end_s: float) -> None:
+    """Go on slowly, each at a moment of its own within the second. Asleep in between: the machine is shared."""
+    begun_s, readers = time.monotonic(), [each for each in slow if each.is_reader]
+    due = deque((begun_s + _BYTE_EVERY_S * (1 + row / len(slow)), each) for row, each in enumerate(slow))
+    with selectors.DefaultSelector() as selector:
+        for each in slow:
+            if not each.is_reader:
+                selector.register(each.socket, selectors.EVENT_READ, each)
+        while (now_s := time.monotonic()) < end_s and any(each.open_s is None for each in slow):
+            asking = [each for each in readers if each.open_s is None]
+            next_s = min(end_s, due[0][0] if due else end_s, now_s + _TICK_S if asking else end_s)
+            for key, _ in selector.select(max(0.0, next_s - now_s)):
+                key.data.receive()
+                if key.data.open_s is not None:
+                    selector.unregister(key.fileobj)
+                    key.data.socket.close()
+            while due and due[0][0] <= time.monotonic():
+                at_s, each = due.popleft()
+                if each.send_byte():
+                    due.append((at_s + _BYTE_EVERY_S, each))
+            for each in asking:
+                each.send_again()
 
 
 def _connect(address: str) -> socket.socket:
