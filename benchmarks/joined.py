@@ -68,7 +68,7 @@ class _AtOnce:
 class _Free:
     """Looks at sockets that there are none of: every turn has its own."""
 
-    is_free = True
+    is_free, backlog_us = True, 0.0
 
     def take(self) -> None:
         pass

@@ -1,50 +1,50 @@
-"""What does a server do with half, all and twice of what it can carry, when every request has a deadline?
+"""What does a server do with a quarter to twice of what it can carry, when every request has a deadline?
+
+    python -m benchmarks.overload [--json]
 
 Capacity is measured first, by engines that begin a frame as soon as the last one is done. Then frames come by the
-clock, at random instants (seeded, Poisson), each to an engine that is free: a frame is a query and its features, each
-with the same deadline. After the worst load comes half of capacity again, and *recovery* is how long after the change
-the last answer left that was not a learned one in time.
+clock (`benchmarks.offered`), and after the worst load half of capacity again: *recovery* is how long it takes from the
+change until, for half a second, as much was learned in time as has to be at half the load. Capacity is measured once
+more at the end: where it differs, the machine was not the same, and the loads were not what they are called.
 
 By the engine's clock an answer is a *miss* that comes later than its deadline; `flagged` is the share of misses that
-say so themselves, by a reason, NOT_READY or `late`. The engine's clock counts the way there and back too, which
-nobody at the server can flag, so misses by less than `way_us` are not counted.
+say so themselves, by a reason, NOT_READY or `late`. The engine's clock counts the way there and back too, which nobody
+at the server can flag, so misses by less than `way_us` are not counted. (`protocol.client` flags those as well, by the
+same clock as here: that would be all of them.) `good_hz` counts frames whose action was learned and in time.
 
-    python -m benchmarks.overload --json
+Exits with another code than 0 unless, at half the load and less, under 1 % fall back or are refused, at the worst one
+99 % of what was accepted is in time and 99 % of the refusals come within half of the deadline, and recovery takes 2 s
+at most. Where a real-time priority is given and the system limits that to a share of a processor, as Linux does, the
+server stands still for the rest of every second in which it has more to do: another 5 % of what is accepted is late.
 """
 
 from __future__ import annotations
 
 import json
-import select
-import socket
-import struct
 import sys
 import time
-from collections.abc import Callable
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
-from urllib.parse import urlsplit
+from typing import Any
 
-import msgpack
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.cores import set_apart
-from benchmarks.recorded import RecordedFrames
+from benchmarks.offered import Answered, Engine, Phase, capacity_hz, offer
 from bot_runtime.bundle import Bundle
-from bot_runtime.golden import Golden, read_golden
+from bot_runtime.golden import read_golden
 from game.launcher import ServerProcess
 
-__all__ = ["Answered", "Overload", "Phase", "main", "measure", "recovery_s", "summary"]
+__all__ = ["Overload", "main", "measure", "recovery_s", "shortcomings", "summary"]
 
-_LENGTH = struct.Struct(">I")
-_TIMEOUT_S = 10.0
 _WARM_UP_S = 1.0
-_FEW = 4  # frames that are out at once while capacity is measured: the server never waits for an engine
+_WINDOW_S, _STEP_S = 0.5, 0.05  # in which recovery is looked for
+_SPARED = 0.01  # of the requests may fall back or be refused at half the load, or be late at any
 
 
 @dataclass(frozen=True)
@@ -56,141 +56,15 @@ class Overload:
     engines: int = 32
     deadline_us: float = 8000.0  # of each request: two make a frame of 16 ms
     way_us: float = 1000.0  # what the way there and back may take
-    loads: tuple[float, ...] = (0.5, 1.0, 2.0)  # shares of capacity; the last one is what it recovers from
-    seconds: float = 5.0  # of each load
-    server: tuple[str, ...] = ()  # more settings of the server, as on its command line
+    loads: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)  # shares of capacity; it recovers from the last one
+    seconds: float = 4.0  # of each load
+    server: str = ""  # more settings of the server, as on its command line
     pin: bool = True  # give the server a core of its own, where there are two
     json: bool = False  # print one JSON line instead of a table
 
 
-class Answered(NamedTuple):
-    """One request: when its answer came and how long it took, and what kind of answer it was."""
-
-    at_s: float
-    ms: float
-    kind: str  # `learned`, `fallback`, `refused`
-    late: bool
-
-
-class Phase(NamedTuple):
-    """A load: how many frames came, how many of them found no engine free, and every request of the others."""
-
-    frames: int
-    unsent: int
-    answers: list[Answered]
-    begun_s: float
-
-
-class _Engine:
-    """One connection, at most one request out."""
-
-    def __init__(self, url: str, bundle: Bundle, golden: Golden, config: Overload) -> None:
-        self.socket = _connect(url)
-        self._frames = RecordedFrames(bundle.manifest.features, golden, config.bots)
-        self._owner, self._deadline_us, self._n_bots = bundle.manifest.features.owner, config.deadline_us, config.bots
-        self.answers: list[Answered] = []
-        self.is_free, self._asking, self._frame, self._received = True, False, 0, bytearray()
-        self._send({"type": "hello", "protocol": 1})
-        self._reply()
-        self._send({"type": "start_bots", "count": config.bots})
-        self._bots = self._reply()["bots"]
-
-    def begin(self) -> None:
-        """Send a frame's query."""
-        self._frame += 1
-        self.is_free, self._asking = False, True
-        self._send({**self._head("request_queries"), "free": self._frames.free(self._frame).tobytes()})
-
-    def receive(self) -> None:
-        """Read what there is; where that completes a reply, go on with the frame."""
-        self._received += self.socket.recv(2**20)
-        if len(self._received) < 4 or len(self._received) < 4 + _LENGTH.unpack_from(self._received)[0]:
-            return
-        reply = msgpack.unpackb(bytes(self._received[4:]))
-        self._received.clear()
-        self.answers.append(self._answered(reply))
-        if reply["type"] != "queries":
-            self.is_free = True
-            return
-        self._asking = False
-        bits_NB = np.frombuffer(reply["queries"], dtype=np.uint8).reshape(self._n_bots, -1)
-        query_NM = np.unpackbits(bits_NB, axis=1, count=int(self._owner.max()) + 1, bitorder="little").view(np.bool_)
-        values = self._frames.costly(self._frame)[query_NM[:, self._owner]].tobytes()
-        self._send({**self._head("submit_features"), "acquired": reply["queries"], "values": values})
-
-    def _answered(self, reply: dict[str, Any]) -> Answered:
-        now_s = time.monotonic()
-        kind = "fallback" if any(reply.get("reasons") or ()) else "learned"
-        if reply["type"] == "error":
-            if reply["code"] != "NOT_READY":
-                raise ConnectionError(f"{reply['code']}: {reply['detail']}")
-            kind = "refused"
-        return Answered(now_s, 1e3 * (now_s - self._sent_s), kind, bool(reply.get("late")))
-
-    def _head(self, kind: str) -> dict[str, Any]:
-        return {"type": kind, "frame": self._frame, "bots": self._bots, "deadline_us": self._deadline_us}
-
-    def _send(self, message: dict[str, Any]) -> None:
-        body = msgpack.packb(message)
-        self._sent_s = time.monotonic()
-        self.socket.sendall(_LENGTH.pack(len(body)) + body)
-
-    def _reply(self) -> dict[str, Any]:
-        with self.socket.makefile("rb") as replies:
-            (size,) = _LENGTH.unpack(replies.read(4))
-            return dict(msgpack.unpackb(replies.read(size)))
-
-
-def _connect(url: str) -> socket.socket:
-    parts = urlsplit(url)
-    connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    connected.settimeout(_TIMEOUT_S)
-    connected.connect(parts.path)
-    return connected
-
-
-def _play(engines: list[_Engine], due: Callable[[], float | None], end_s: float) -> tuple[int, int]:
-    """Begin a frame whenever one is due (`due` gives its instant, None: as soon as few are out), until the end.
-
-    Returns how many frames were due and how many of them found no engine free.
-    """
-    by_socket = {engine.socket: engine for engine in engines}
-    frames, unsent, at_s = 0, 0, due()
-    while (now_s := time.monotonic()) < end_s or any(not engine.is_free for engine in engines):
-        if now_s > end_s + _TIMEOUT_S:
-            raise TimeoutError("answers are missing")
-        while now_s < end_s and (at_s is None or at_s <= now_s):
-            free = next((engine for engine in engines if engine.is_free), None)
-            if at_s is None and sum(not engine.is_free for engine in engines) >= _FEW:
-                break
-            frames, unsent = frames + 1, unsent + (free is None)
-            if free is not None:
-                engines.remove(free)
-                engines.append(free)  # in turn
-                free.begin()
-            at_s = due()
-        wait_s = 0.05 if at_s is None else min(0.05, max(0.0, at_s - time.monotonic()))
-        for ready in select.select(by_socket, [], [], wait_s)[0]:  # by the microsecond, unlike epoll
-            by_socket[ready].receive()
-    return frames, unsent
-
-
-def _phase(engines: list[_Engine], rate_hz: float, seconds: float, seed: int) -> Phase:
-    random, begun_s = np.random.default_rng(seed), time.monotonic()
-    at_s = [begun_s]
-
-    def due() -> float:
-        at_s[0] += random.exponential(1.0 / rate_hz)
-        return at_s[0]
-
-    for engine in engines:
-        engine.answers = []
-    frames, unsent = _play(engines, due, begun_s + seconds)
-    return Phase(frames, unsent, sorted(each for engine in engines for each in engine.answers), begun_s)
-
-
 def summary(phase: Phase, deadline_us: float, way_us: float) -> dict[str, float]:
-    """Shares of requests and percentiles of their times in ms."""
+    """Shares of requests, percentiles of their times in ms, and why requests fell back."""
     limit_ms = (deadline_us + way_us) / 1e3
     ms = {kind: [each.ms for each in phase.answers if each.kind == kind] for kind in ("learned", "fallback", "refused")}
     missed = [each for each in phase.answers if each.ms > limit_ms]
@@ -198,7 +72,11 @@ def summary(phase: Phase, deadline_us: float, way_us: float) -> dict[str, float]
     accepted = ms["learned"] + ms["fallback"]
     n_requests = max(1, len(phase.answers))
     rows = {"frames": float(phase.frames), "unsent_pct": 100.0 * phase.unsent / max(1, phase.frames)}
+    rows["sent_late_p99_ms"] = float(np.percentile(phase.sent_late_ms or [0.0], 99.0))
+    rows["good_hz"] = _good_hz(phase, limit_ms)
     rows |= {f"{kind}_pct": 100.0 * len(of_kind) / n_requests for kind, of_kind in ms.items()}
+    causes = Counter(each.cause for each in phase.answers if each.cause)
+    rows |= {f"{cause}_pct": 100.0 * n / n_requests for cause, n in sorted(causes.items())}
     rows["in_time_pct"] = 100.0 * sum(each <= limit_ms for each in accepted) / max(1, len(accepted))
     rows |= {"missed": float(len(missed)), "flagged_pct": 100.0 * len(flagged) / len(missed) if missed else 100.0}
     for name, of_kind in (("accepted", accepted), ("refused", ms["refused"])):
@@ -208,54 +86,89 @@ def summary(phase: Phase, deadline_us: float, way_us: float) -> dict[str, float]
     return rows
 
 
-def recovery_s(phase: Phase, deadline_us: float, way_us: float) -> float:
-    """From the beginning of a bearable load to the last answer in its first half that was not a learned one in time.
+def _good_hz(phase: Phase, limit_ms: float) -> float:
+    if not phase.answers:
+        return 0.0
+    good = sum(each.is_whole and _is_good(each, limit_ms) for each in phase.answers)
+    return good / (phase.answers[-1].at_s - phase.begun_s)
 
-    Of the first half only: a machine that others use too stalls now and then at any load. As long as that half is: it
-    did not recover within it.
+
+def _is_good(answered: Answered, limit_ms: float) -> bool:
+    return answered.kind == "learned" and answered.ms <= limit_ms
+
+
+def recovery_s(phase: Phase, deadline_us: float, way_us: float) -> float:
+    """From the beginning of a bearable load until, for half a second, all but 1 % was learned and in time.
+
+    Not until the last answer that was not: a machine that others use too stalls now and then at any load. As long as
+    the phase is, where it did not recover within it.
     """
-    half_s = phase.begun_s + (phase.answers[-1].at_s - phase.begun_s) / 2 if phase.answers else 0.0
     limit_ms = (deadline_us + way_us) / 1e3
-    bad_s = [each.at_s for each in phase.answers if each.kind != "learned" or each.ms > limit_ms]
-    return max((at_s - phase.begun_s for at_s in bad_s if at_s < half_s), default=0.0)
+    at_s = np.array([each.at_s - phase.begun_s for each in phase.answers])
+    good = np.array([_is_good(each, limit_ms) for each in phase.answers])
+    whole_s = float(at_s[-1]) if len(at_s) else 0.0
+    for from_s in np.arange(0.0, whole_s - _WINDOW_S, _STEP_S).tolist():
+        within = (at_s >= from_s) & (at_s < from_s + _WINDOW_S)
+        if within.any() and good[within].mean() >= 1.0 - _SPARED:
+            return float(from_s)
+    return whole_s
+
+
+def shortcomings(measured: dict[str, Any], deadline_us: float) -> list[str]:
+    """What is not as it should be, in words."""
+    found = []
+    for load, rows in measured["loads"].items():
+        if float(load) <= 0.5 and rows["learned_pct"] < 100.0 * (1.0 - _SPARED):
+            found.append(f"at {load} x {100.0 - rows['learned_pct']:.2f} % were not learned, expected less than 1 %")
+    load, rows = list(measured["loads"].items())[-1]
+    if rows["in_time_pct"] < 100.0 * (1.0 - _SPARED):
+        found.append(f"at {load} x {rows['in_time_pct']:.2f} % of what was accepted was in time, expected 99 %")
+    if rows["refused_p99_ms"] > deadline_us / 2e3:
+        found.append(f"at {load} x refusals took {rows['refused_p99_ms']:.1f} ms (p99), expected {deadline_us / 2e3:g}")
+    if measured["recovery_s"] > 2.0:
+        found.append(f"recovery took {measured['recovery_s']:.2f} s, expected 2")
+    return found
 
 
 def measure(config: Overload) -> dict[str, Any]:
-    """Capacity in frames a second, a summary by load, and how long recovery took."""
+    """Capacity in frames a second, before and after, a summary by load, and how long recovery took."""
     bundle = Bundle.load(config.bundle)
     golden = read_golden((config.bundle / "golden.npz").read_bytes(), bundle.manifest)
     with ExitStack() as stack:
         most = ("--max-bots", str(config.bots * config.engines), "--max-connections", str(config.engines))
-        server = stack.enter_context(ServerProcess(config.bundle, *most, *config.server))
+        server = stack.enter_context(ServerProcess(config.bundle, *most, *config.server.split()))
         if config.pin:
             stack.callback(set_apart([server.pid]))
-        engines = [_Engine(server.addresses()["unix"], bundle, golden, config) for _ in range(config.engines)]
+        url = server.addresses()["unix"]
+        engines = [Engine(url, bundle, golden, config.bots, config.deadline_us) for _ in range(config.engines)]
         for engine in engines:
             stack.callback(engine.socket.close)
-        _play(engines, lambda: None, time.monotonic() + _WARM_UP_S)
-        begun_s = time.monotonic()
-        capacity_hz = _play(engines, lambda: None, begun_s + config.seconds)[0] / (time.monotonic() - begun_s)
+        capacity_hz(engines, _WARM_UP_S)
+        before_hz = capacity_hz(engines, config.seconds)
         phases = {
-            f"{load:g}": _phase(engines, load * capacity_hz, config.seconds, seed)
+            f"{load:g}": offer(engines, load * before_hz, config.seconds, seed)
             for seed, load in enumerate(config.loads)
         }
-        after = _phase(engines, 0.5 * capacity_hz, config.seconds, len(config.loads))
+        after = offer(engines, 0.5 * before_hz, config.seconds, len(config.loads))
+        time.sleep(_WINDOW_S)
+        after_hz = capacity_hz(engines, config.seconds / 2)
     limits = (config.deadline_us, config.way_us)
     return {
-        "capacity_hz": round(capacity_hz, 1),
+        "capacity_hz": round(before_hz, 1),
+        "capacity_after_hz": round(after_hz, 1),
         "loads": {load: summary(phase, *limits) for load, phase in phases.items()},
         "recovery_s": round(recovery_s(after, *limits), 3),
     }
 
 
 def _table(measured: dict[str, Any]) -> Table:
-    title = f"capacity {measured['capacity_hz']:,.0f} frames/s; recovered {measured['recovery_s']:.2f} s after"
-    table = Table(title=title)
+    capacity = f"capacity {measured['capacity_hz']:,.0f} frames/s, {measured['capacity_after_hz']:,.0f} at the end"
+    table = Table(title=f"{capacity}; recovered {measured['recovery_s']:.2f} s after")
     table.add_column("")
     for load in measured["loads"]:
         table.add_column(f"{load} x", justify="right")
-    for name in next(iter(measured["loads"].values())):
-        table.add_row(name, *(f"{rows[name]:,.2f}" for rows in measured["loads"].values()))
+    for name in dict.fromkeys(name for rows in measured["loads"].values() for name in rows):
+        table.add_row(name, *(f"{rows.get(name, 0.0):,.2f}" for rows in measured["loads"].values()))
     return table
 
 
@@ -263,10 +176,13 @@ def main() -> None:
     """Command line."""
     config = tyro.cli(Overload, description=__doc__)
     measured = measure(config)
+    failed = shortcomings(measured, config.deadline_us)
     if config.json:
-        print(json.dumps(measured))
+        print(json.dumps({**measured, "shortcomings": failed}))
     else:
         Console(file=sys.stdout).print(_table(measured))
+        print("\n".join(failed))
+    sys.exit(bool(failed))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How long work of a size takes, from what it took lately: a median to plan by, and what is usual.
+"""How long work of a size takes, from what it took lately: a median to plan by, a mean to add up, and what is usual.
 
 This module knows nothing about what the work is. Sizes that share a power of two share what is known of them.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from statistics import fmean
 
 __all__ = ["Durations"]
 
@@ -39,18 +40,27 @@ class Durations:
         others use as well, nine in ten would take many times as long. 0 where nothing was measured lately: then only
         trying tells.
         """
-        now = self._clock()
-        for magnitude in range(size.bit_length(), -1, -1):
-            measured = self._by_magnitude.get(magnitude)
-            predicted_us = measured.predicted_us(now) if measured is not None else 0.0
-            if predicted_us:
-                return predicted_us
-        return 0.0
+        recent = self._recent(size)
+        return sorted(recent)[len(recent) // 2] if recent else 0.0
+
+    def mean_us(self, size: int) -> float:
+        """The same, but the mean: of several that are done one after the other, each may be the one that takes long."""
+        recent = self._recent(size)
+        return fmean(recent) if recent else 0.0
 
     def usual_us(self, size: int) -> float | None:
         """The median of all that was ever measured of this size; None where nothing was."""
         measured = self._by_magnitude.get(size.bit_length())
         return None if measured is None else measured.usual_us
+
+    def _recent(self, size: int) -> list[float]:
+        now_ns = self._clock()
+        for magnitude in range(size.bit_length(), -1, -1):
+            measured = self._by_magnitude.get(magnitude)
+            recent = measured.recent(now_ns) if measured is not None else []
+            if recent:
+                return recent
+        return []
 
 
 class _Measured:
@@ -64,7 +74,6 @@ class _Measured:
         self.usual_us *= _USUAL_STEP if us > self.usual_us else 1 / _USUAL_STEP
         self._recent.append((now_ns, us))
 
-    def predicted_us(self, now_ns: int) -> float:
-        """Sorted here: every turn is measured, and only those with a deadline ask."""
-        recent = sorted(us for at_ns, us in tuple(self._recent) if now_ns - at_ns <= _RECENT_NS)
-        return recent[len(recent) // 2] if recent else 0.0
+    def recent(self, now_ns: int) -> list[float]:
+        """Looked through here: every turn is measured, and only those with a deadline ask."""
+        return [us for at_ns, us in tuple(self._recent) if now_ns - at_ns <= _RECENT_NS]

@@ -68,6 +68,7 @@ class Desk:
         self._strangers = Pace()
         self._clock = clock
         self._worker_clock = worker_clock
+        self._ended_ns = 0  # when the worker last ended a request: its thread alone looks at this
 
     def ask(
         self,
@@ -112,27 +113,29 @@ class Desk:
         return arrival if deadline is None else Arrival(arrival.transport, arrival.received_ns, deadline)
 
     def _in_turn(self, asked: Asked) -> Answered:
-        """Begin at once or, behind others and where this look has had its turn, in the line; or refuse at once."""
-        if self.looks.is_free or (len(self.looks) == 0 and not self._is_quick(asked)):
-            return self._begin(asked)
-        refused = self._refused(asked, self.looks.backlog_us)
+        """Refuse at once, begin at once or, behind others and where this look has had its turn, in the line."""
+        refused = self._refused(asked, self.looks.backlog_us, is_new=asked.kind is not SubmitFeatures)
         if refused is not None:
             return refused
+        if self.looks.is_free or (len(self.looks) == 0 and not self._is_quick(asked)):
+            return self._begin(asked)
         if len(self.looks) + self._worker.n_waiting >= self._worker.max_queue:
-            return self._too_many(asked)
+            return self._refuse(asked, NotReady("too many requests are waiting already", retry_after_s=0.1))
         outcome: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._line[outcome] = asked
         self.looks.put(partial(self._begin_for, outcome, asked), asked.work_us)
         return outcome
 
     def _begin_for(self, outcome: asyncio.Future[Answer], asked: Asked) -> None:
+        """Its turn has come, after waiting."""
         if self._line.pop(outcome, None) is None:
             return  # it was answered together with another
         others = companions(asked, self._line, self._most, self._is_quick)
         if others and asked.serving is not None:
             self._answer_together(asked.serving, [(outcome, asked), *others])
             return
-        answered = self._begin(asked)
+        refused = self._refused(asked)
+        answered = self._begin(asked) if refused is None else refused
         if isinstance(answered, Answer):
             _settle(outcome, answered)
         else:
@@ -143,7 +146,7 @@ class Desk:
         begun = []
         for outcome, asked in group:
             self._line.pop(outcome, None)
-            refused = self._refused(asked, 0.0)
+            refused = self._refused(asked)
             if refused is None:
                 begun.append((outcome, asked))
             else:
@@ -158,16 +161,13 @@ class Desk:
             _settle(outcome, self._sealed(asked, answered, took_us / len(begun)))
 
     def _begin(self, asked: Asked) -> Answered:
-        """Answer here, or have the worker do it by its deadline, or refuse where that cannot be."""
-        refused = self._refused(asked, 0.0)
-        if refused is not None:
-            return refused
+        """Answer here, or have the worker do it by its deadline."""
         if self._is_quick(asked):
             return self._answered_here(asked)
         try:
-            answered = self._worker.run(partial(self._answered_there, asked), asked.work_us)
-        except NotReady:
-            return self._too_many(asked)
+            answered = self._worker.run(partial(self._answered_there, asked, self._clock()), asked.work_us)
+        except NotReady as error:
+            return self._refuse(asked, error)
         deadline = asked.arrival.deadline
         return answered if deadline is None else self.due.watched(deadline, answered, asked.form)
 
@@ -191,30 +191,27 @@ class Desk:
         _note(asked, answered, took_us)
         return self.due.kept(deadline, answered, asked.form)
 
-    def _answered_there(self, asked: Asked) -> Answer:
-        """On the worker's thread."""
-        begun_ns, worker_ns = self._clock(), self._worker_clock()
+    def _answered_there(self, asked: Asked, put_ns: int) -> Answer:
+        """On the worker's thread. The whole of it is from the last one's end, or from when it was put there."""
+        begun_ns, worker_ns = max(put_ns, self._ended_ns), self._worker_clock()
         answered = finished(asked.steps())
         if asked.turn is not None:
             asked.pace.observe(asked.turn, (self._worker_clock() - worker_ns) / 1e3)
-        _note(asked, answered, (self._clock() - begun_ns) / 1e3)
+        self._ended_ns = self._clock()
+        _note(asked, answered, (self._ended_ns - begun_ns) / 1e3)
         return answered
 
-    def _refused(self, asked: Asked, line_us: float) -> Answer | None:
+    def _refused(self, asked: Asked, line_us: float = 0.0, *, is_new: bool = False) -> Answer | None:
         """The refusal of what would wait in the line for so long, and then for the worker, for longer than it may."""
         deadline = asked.arrival.deadline
         if deadline is None:
             return None
-        wait_us = line_us + self._worker.backlog_us
-        is_new = asked.kind is not SubmitFeatures
-        refused = self.due.refusal_of(deadline, wait_us, asked.work_us, asked.form, is_new=is_new)
-        if refused is not None:
-            self.handlers.recorder.refused(asked.arrival.transport, NotReady.code)
-        return refused
+        error = self.due.refusal_of(deadline, line_us + self._worker.backlog_us, asked.work_us, is_new=is_new)
+        return None if error is None else self._refuse(asked, error)
 
-    def _too_many(self, asked: Asked) -> Answer:
-        self.handlers.recorder.refused(asked.arrival.transport, NotReady.code)
-        return refusal(NotReady("too many requests are waiting already", retry_after_s=0.1), asked.form)
+    def _refuse(self, asked: Asked, error: NotReady) -> Answer:
+        self.handlers.recorder.refused(asked.arrival.transport, error.code)
+        return refusal(error, asked.form)
 
 
 def _note(asked: Asked, answered: Answer, took_us: float) -> None:

@@ -22,9 +22,9 @@ from server.written import written
 
 __all__ = ["Due"]
 
-# What waits before new work may take half of what its deadline leaves: a machine that becomes slower by up to two then
-# keeps it. That costs nothing, for there is a line. A turn whose first half was answered is worth more than that.
-_NEW_SHARE = 2.0
+# What waits before new work may take two thirds of what its deadline leaves: a machine that becomes half as slow again
+# then keeps it. That costs nothing where there always is a line. A turn that was half answered is worth more.
+_NEW_SHARE = 1.5
 _TICK_US = 1000.0  # the event loop's timers count whole ms, and may be early by one
 
 
@@ -51,9 +51,9 @@ class Due:
         return Deadline(self._looks.since_ns(received_ns), limit_us, self._clock)
 
     def refusal_of(
-        self, deadline: Deadline, wait_us: float, work_us: float, form: Format, *, is_new: bool
-    ) -> Answer | None:
-        """The refusal of a request that waits for too long, if it does.
+        self, deadline: Deadline, wait_us: float, work_us: float, *, is_new: bool = False
+    ) -> NotReady | None:
+        """Why a request is refused, if there is not enough time for it.
 
         That is quicker than to let its bots fall back, which would cost those that can still be served their time. A
         deadline that would not do without any waiting either is no reason: then the bots fall back.
@@ -63,7 +63,7 @@ class Due:
             return None
         self.n_refused += 1
         busy = f"the deadline leaves {left_us:.0f} us, for {wait_us:.0f} of waiting and {work_us:.0f} of work"
-        return refusal(NotReady(busy, retry_after_s=max(wait_us, work_us) / 1e6), form)
+        return NotReady(busy, retry_after_s=max(wait_us, work_us) / 1e6)
 
     def kept(self, deadline: Deadline, answered: Answer, form: Format) -> Answer:
         """The answer as it leaves now: one that is late says so."""

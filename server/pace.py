@@ -41,8 +41,8 @@ class Pace:
             self._us[kind] = min(2.0 * known_us, took_us) if took_us > known_us else 0.93 * known_us
 
     def whole_us(self, kind: type[object], size: int) -> float:
-        """The median of what work of this kind and size took lately, all in all; 0 where nothing is known."""
-        return self._wholes[kind].predicted_us(size) if kind in self._wholes else 0.0
+        """The mean of what work of this kind and size took lately, all in all; 0 where nothing is known."""
+        return self._wholes[kind].mean_us(size) if kind in self._wholes else 0.0
 
     def observe_whole(self, kind: type[object], size: int, took_us: float) -> None:
         """Work has taken so long, waiting for the machine included."""

@@ -47,3 +47,14 @@ def test_a_size_that_was_never_measured_takes_no_less_than_a_smaller_one() -> No
     durations.observe(16, 30.0)
     assert [durations.predicted_us(size) for size in (1, 2, 15, 64)] == [0.0, 10.0, 10.0, 30.0]
     assert durations.usual_us(64) is None
+
+
+def test_a_mean_is_of_what_a_median_is_of() -> None:
+    clock = Clock()
+    durations = Durations(clock)
+    assert durations.mean_us(4) == 0.0
+    for us in (50.0, 50.0, 500.0):
+        durations.observe(4, us)
+    assert (durations.predicted_us(4), durations.mean_us(4), durations.mean_us(64)) == (50.0, 200.0, 200.0)
+    clock.ns += 10**9 + 1
+    assert durations.mean_us(4) == 0.0
