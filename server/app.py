@@ -46,6 +46,7 @@ if TYPE_CHECKING:  # an extra, imported where it is asked for
 __all__ = ["running"]
 
 _BACKLOG = 512
+_SEND_BYTES = 2**16  # of answers that a client does not take; the system's own limit grows to megabytes a socket
 _CLOSE_S = 0.5  # for what is still running after the drain
 
 
@@ -227,6 +228,7 @@ def _listen(host: str, port: int) -> socket.socket:
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BYTES)  # and of all that are accepted
         listening.bind((host, port))
         listening.listen(_BACKLOG)
     except OSError:
