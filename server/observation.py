@@ -42,7 +42,7 @@ def watch(
     readiness.register("worker", partial(_stuck, worker.busy_s, settings.stuck_after_s))
     metrics.register(partial(families.requests, handlers.recorder))
     metrics.register(lambda: families.bundles(handlers.servings))
-    metrics.register(partial(_saturation, settings, connections, worker))
+    metrics.register(partial(_saturation, settings, connections, worker, sockets))
     metrics.register(partial(families.deadlines, sockets.desk.due))
     metrics.register(lambda: families.sockets(_by_transport(sockets, crowd)))
     metrics.register(lambda: families.readiness(readiness.names, readiness.failing()))
@@ -69,14 +69,15 @@ def _by_transport(sockets: Sockets, crowd: Crowd) -> dict[str, int]:
     return {**counted, "http": len(crowd) - counted.get("ws", 0)}
 
 
-def _saturation(settings: Settings, connections: Connections, worker: Worker) -> Iterator[Metric]:
+def _saturation(settings: Settings, connections: Connections, worker: Worker, sockets: Sockets) -> Iterator[Metric]:
     """How full the server is, each number beside its limit."""
+    n_waiting = worker.n_waiting + len(sockets.desk.looks)
     for name, help_text, number in (
         ("bots_limit", "Bots that fit, of all bundles.", settings.max_bots),
         ("connections", "Connections.", len(connections)),
         ("connections_limit", "Connections that fit.", settings.max_connections),
         ("http_sockets_limit", "Sockets that the HTTP port may have, WebSockets included.", settings.http_sockets),
-        ("queue_length", "Requests that wait for the worker, with the one that it answers.", worker.n_waiting),
+        ("queue_length", "Requests that wait, with the one that the worker answers.", n_waiting),
         ("queue_limit", "Requests that may wait.", worker.max_queue),
         (
             "worker_busy_seconds",
