@@ -45,6 +45,7 @@ class Density:
     int8: Path = Path("bundles/hard-int8")  # its int8 variant; left out where there is no such folder
     door: Literal["unix", "tcp"] = "unix"
     engines: int = 4  # connections that share the bots
+    batch_connections: int = 1  # turns of up to so many of them are inferred as one batch
     hz: float = 60.0
     seconds: float = 5.0  # of each run
     attempts: int = 2  # runs that a number of bots has to be carried in one of
@@ -117,6 +118,7 @@ def measure(path: Path, config: Density, processes: int | None, console: Console
 def _served(path: Path, config: Density, processes: int | None) -> Iterator[str]:
     """Where to connect to: one server, or HAProxy before several."""
     arguments = ("--tcp-port", "0", "--max-bots", str(config.most), "--max-connections", str(4 * config.engines))
+    arguments += ("--batch-connections", str(config.batch_connections))
     with ExitStack() as stack:
         servers = [
             stack.enter_context(ServerProcess(path, *arguments, "--process", f"p{number}"))
