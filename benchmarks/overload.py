@@ -15,7 +15,8 @@ same clock as here: that would be all of them.) `good_hz` counts frames whose ac
 Exits with another code than 0 unless, at half the load and less, under 1 % fall back or are refused, at the worst one
 99 % of what was accepted is in time and 99 % of the refusals come within half of the deadline, and recovery takes 2 s
 at most. Where a real-time priority is given and the system limits that to a share of a processor, as Linux does, the
-server stands still for the rest of every second in which it has more to do: another 5 % of what is accepted is late.
+server stands still for the rest of every second in which it has more to do, and at twice the load figures are far
+worse than without such a priority: see adr/0020.
 """
 
 from __future__ import annotations
