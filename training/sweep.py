@@ -225,13 +225,11 @@ def _table(outcomes: list[Outcome]) -> Table:
     table.add_column("run", overflow="fold")
     for name in ("state", "updates"):
         table.add_column(name, no_wrap=True)
-    for name in ("still to evaluate", ""):
-        table.add_column(name, overflow="fold")
+    table.add_column("still to evaluate", overflow="fold")
     for outcome in outcomes:
         run = outcome.run
-        where = f"see {run.config.out / 'log.txt'}" if outcome.state == "failed" else ""
         updates = f"{run.progress()}/{run.config.updates}"
-        table.add_row(run.name, outcome.state, updates, " ".join(run.missing()), escape(where))
+        table.add_row(run.name, outcome.state, updates, " ".join(run.missing()))
     return table
 
 
@@ -245,7 +243,10 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         sys.exit("stopped: the same command goes on from here")
     console.print(_table(outcomes))
-    if any(outcome.state == "failed" for outcome in outcomes):
+    failed = [outcome.run for outcome in outcomes if outcome.state == "failed"]
+    for run in failed:
+        console.print(escape(f"{run.name} failed: see {run.config.out / 'log.txt'}"), soft_wrap=True)
+    if failed:
         sys.exit(1)
 
 
