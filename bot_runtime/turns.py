@@ -108,7 +108,8 @@ class Turns:
         if not repeats:
             return None
         turn = self._turns.get(int(self._turn_of_B[company.slots_N[0]]))
-        if turn is None or not _are_its_bots(company, turn):
+        # The first bot's last turn may be an earlier one of them all, when another of them began this frame alone.
+        if turn is None or turn.frame != frame or not _are_its_bots(company, turn):
             raise FrameReused(f"frame {frame} was requested before with other bots, or in another order")
         if turn.taken is not (event is Event.TURN):
             raise FrameReused(f"frame {frame} came before by another message than {event.value}")

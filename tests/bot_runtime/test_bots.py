@@ -119,6 +119,15 @@ def test_bots_regroup_between_frames(engine: Engine) -> None:
     assert engine.bots._turns._turns == {}
 
 
+def test_a_frame_that_one_bot_began_alone_is_no_retry_of_all(engine: Engine) -> None:
+    """Though the first bot's last turn was one of both: the same content does not get that turn's answer again."""
+    handles = engine.bots.start(2)
+    engine.turn(handles, 0)
+    engine.bots.request_queries(handles[1:], 1, engine.free(1, 1))
+    with pytest.raises(errors.FrameReused):
+        engine.bots.request_queries(handles, 1, engine.free(0, 2), engine.rewards(0, 2))
+
+
 def test_old_turns_are_forgotten(engine: Engine) -> None:
     handles = engine.bots.start(4)
     for frame in range(50):
