@@ -60,8 +60,7 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
     token, admin_token = settings.tokens()
     servings = Servings(settings.max_bots, settings.max_loaded)
     connections = Connections(settings.max_connections, settings.idle_ttl_s, clock, process=settings.process)
-    default_us = settings.default_deadline_us
-    handlers = Handlers(servings, connections, token, default_deadline_us=default_us)
+    handlers = Handlers(servings, connections, token, default_deadline_us=settings.default_deadline_us)
     async with AsyncExitStack() as stack:
         worker = Worker(settings.max_queue)
         stack.callback(worker.close, _CLOSE_S)
@@ -72,27 +71,14 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
             admin_token=admin_token,
             body_deadline_s=settings.frame_deadline_s,
         )
-        desk = Desk(
-            handlers,
-            worker,
-            inline_us=settings.inline_us,
-            batch_connections=settings.batch_connections,
-            default_deadline_us=default_us,
-        )
-        sockets = Sockets(
-            desk,
-            max_sockets=settings.max_connections,
-            frame_deadline_s=settings.frame_deadline_s,
-            idle_ttl_s=settings.idle_ttl_s,
-            spin_us=settings.spin_us,
-        )
+        sockets = _sockets(settings, handlers, worker)
         crowd = Crowd(settings.http_sockets)
         readiness, metrics = watch(settings, handlers, connections, worker, sockets, crowd)
         if settings.otlp_endpoint is not None:
             stack.callback(_telemetry(metrics, settings.otlp_endpoint, settings.otlp_every_s).close)
         rest = create_app(HttpDoor(handlers, worker), Probes(handlers, readiness, metrics))
         add_routes(rest, admin)
-        application = Exchange(desk, rest, sockets.brake, sockets.vigil, body_deadline_s=settings.frame_deadline_s)
+        application = Exchange(sockets, rest, body_deadline_s=settings.frame_deadline_s)
         uvicorn_server, http_address = await stack.enter_async_context(
             _http(
                 settings,
@@ -114,6 +100,24 @@ async def running(settings: Settings, *, clock: Callable[[], float] = time.monot
         finally:
             readiness.is_draining = True
             uvicorn_server.should_exit = True  # drains in its own task while the streams are drained here
+
+
+def _sockets(settings: Settings, handlers: Handlers, worker: Worker) -> Sockets:
+    """The desk, and what all doors in front of it share."""
+    desk = Desk(
+        handlers,
+        worker,
+        inline_us=settings.inline_us,
+        batch_connections=settings.batch_connections,
+        default_deadline_us=settings.default_deadline_us,
+    )
+    return Sockets(
+        desk,
+        max_sockets=settings.max_connections,
+        frame_deadline_s=settings.frame_deadline_s,
+        idle_ttl_s=settings.idle_ttl_s,
+        spin_us=settings.spin_us,
+    )
 
 
 def _telemetry(metrics: Metrics, endpoint: str, every_s: float) -> Telemetry:

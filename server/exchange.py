@@ -25,10 +25,8 @@ from protocol.errors import (
     UnsupportedMediaType,
 )
 from server.answer import Answer, Arrival, refusal
-from server.brake import Brake
-from server.desk import Desk
 from server.openapi import CONNECTION_HEADER, ROUTES
-from server.vigil import Vigil
+from server.sockets import Sockets
 
 __all__ = ["FORMATS", "Exchange", "accepted"]
 
@@ -40,12 +38,10 @@ _Headers = dict[bytes, bytes]
 
 
 class Exchange:
-    """Answers POST requests to the messages' paths at this desk; passes all others on to `rest`."""
+    """Answers POST requests to the messages' paths at the desk of these sockets; passes all others on to `rest`."""
 
-    def __init__(self, desk: Desk, rest: ASGIApp, brake: Brake, vigil: Vigil, *, body_deadline_s: float) -> None:
-        self._desk = desk
-        self._brake = brake
-        self._vigil = vigil
+    def __init__(self, sockets: Sockets, rest: ASGIApp, *, body_deadline_s: float) -> None:
+        self._desk, self._brake, self._vigil = sockets.desk, sockets.brake, sockets.vigil
         self._rest = rest
         self._body_deadline_s = body_deadline_s
         self._kinds = {path: kind for path, (kind, _) in ROUTES.items()}

@@ -6,7 +6,7 @@ This module knows nothing about messages and how they are exchanged (`server.exc
 from __future__ import annotations
 
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from functools import partial
 
 import msgspec
@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
+from bot_runtime.bundle import Bundle
 from protocol import messages
 from protocol.codec import Format
 from protocol.errors import (
@@ -54,19 +55,19 @@ class HttpDoor:
 
     async def manifest(self, request: Request) -> Response:
         """`manifest.json` of the bundle with the hash in the path, to the byte; needs the token as `bundle` does."""
-        return await self._file(request, "manifest_json", Format.JSON.value)
+        return await self._file(request, lambda bundle: bundle.manifest_json, Format.JSON.value)
 
     async def acquisition(self, request: Request) -> Response:
         """`acquisition.onnx` of the same, for an engine that runs the head itself."""
-        return await self._file(request, "acquisition", "application/octet-stream")
+        return await self._file(request, lambda bundle: bundle.acquisition, "application/octet-stream")
 
-    async def _file(self, request: Request, part: str, media_type: str) -> Response:
+    async def _file(self, request: Request, part: Callable[[Bundle], bytes], media_type: str) -> Response:
         try:
             check_bearer(self._handlers, request)
             serving = await self._worker.run(partial(self._handlers.servings.of, request.path_params["sha256"]))
         except ProtocolError as error:
             return _refused(error, Format.JSON)
-        content = getattr(serving.bots.bundle, part)
+        content = part(serving.bots.bundle)
         # What a hash names never changes.
         headers = {"Content-Length": str(len(content)), "Cache-Control": "private, max-age=31536000, immutable"}
         return StreamingResponse(_pieces(content), headers=headers, media_type=media_type)

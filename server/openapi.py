@@ -45,20 +45,6 @@ _CONNECTION = {
     "description": "The `connection` of Welcome.",
     "schema": {"type": "string"},
 }
-_NAME = {
-    "name": "name",
-    "in": "path",
-    "required": True,
-    "description": "A bundle's name.",
-    "schema": {"type": "string", "pattern": "^[a-z0-9][a-z0-9_-]{0,63}$"},
-}
-_SHA256 = {
-    "name": "sha256",
-    "in": "path",
-    "required": True,
-    "description": "`bundle_sha256` of Welcome or BotsStarted.",
-    "schema": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
-}
 _BEARER: dict[str, list[str]] = {"bearer": []}
 _REF = "#/components/schemas/{name}"
 
@@ -103,7 +89,7 @@ def _admin_paths() -> dict[str, Any]:
     paths["/v1/bundles"]["get"]["responses"]["200"]["content"] = _json({"type": "array", "items": _schema(Listed)})
     for path, kind in ADMIN_ROUTES.items():
         operation = _bearer_operation(kind.__name__, str(kind.__doc__), Record)
-        operation["parameters"] = [_NAME]
+        operation["parameters"] = [_in_path("name", "A bundle's name.", "^[a-z0-9][a-z0-9_-]{0,63}$")]
         operation["requestBody"] = {"required": True, "content": _json(_schema(kind))}
         paths[path] = {"post": operation}
     return paths
@@ -114,7 +100,7 @@ def _head_paths() -> dict[str, Any]:
     paths = {}
     for path, media_type in HEAD_ROUTES.items():
         operation = _bearer_operation("Head", "A file of a bundle in memory, to the byte.", messages.Error)
-        operation["parameters"] = [_SHA256]
+        operation["parameters"] = [_in_path("sha256", "`bundle_sha256` of Welcome or BotsStarted.", "^[0-9a-f]{64}$")]
         operation["responses"]["200"] = {"description": "The file", "content": {media_type: {"schema": {}}}}
         paths[path] = {"get": operation}
     return paths
@@ -127,6 +113,11 @@ def _bearer_operation(summary: str, description: str, reply: type[msgspec.Struct
     }
     answered = {"200": {"description": reply.__name__, "content": _json(_schema(reply))}}
     return {"summary": summary, "description": description, "security": [_BEARER], "responses": answered | refused}
+
+
+def _in_path(name: str, description: str, pattern: str) -> dict[str, Any]:
+    schema = {"type": "string", "pattern": pattern}
+    return {"name": name, "in": "path", "required": True, "description": description, "schema": schema}
 
 
 def _schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
