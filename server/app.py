@@ -18,6 +18,7 @@ import uvicorn
 from bot_runtime.bundle import Bundle
 from bot_runtime.signature import Keys
 from protocol.transport import SOCKET_PATH
+from server.acceptor import Acceptor
 from server.admin import AdminDoor, add_routes
 from server.catalogue import Catalogue
 from server.connections import Connections
@@ -26,6 +27,7 @@ from server.desk import Desk
 from server.exchange import Exchange
 from server.handlers import Handlers
 from server.http import HttpDoor, create_app
+from server.listening import listen_tcp, listen_unix
 from server.metrics import Metrics
 from server.observation import watch
 from server.probes import Probes
@@ -45,8 +47,6 @@ if TYPE_CHECKING:  # an extra, imported where it is asked for
 
 __all__ = ["running"]
 
-_BACKLOG = 512
-_SEND_BYTES = 2**16  # of answers that a client does not take; the system's own limit grows to megabytes a socket
 _CLOSE_S = 0.5  # for what is still running after the drain
 
 
@@ -144,18 +144,29 @@ def _filled(servings: Servings, worker: Worker, settings: Settings) -> Catalogue
 
 
 class _Uvicorn(uvicorn.Server):
-    """uvicorn without its signal handlers: it would end the process by raising the signal again, not with 0."""
+    """uvicorn without its signal handlers, which would end the process by raising the signal again, not with 0.
+
+    Its sockets are accepted as the other doors' are.
+    """
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets=[])
+        self.servers = [Acceptor(each, self._protocol) for each in sockets or []]  # type: ignore[misc]
+
+    def _protocol(self) -> asyncio.Protocol:
+        make: Callable[..., asyncio.Protocol] = self.config.http_protocol_class
+        return make(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
 
 
 @asynccontextmanager
 async def _http(
     settings: Settings, application: Exchange, protocol: Any, socket_protocol: Any
 ) -> AsyncIterator[tuple[uvicorn.Server, str]]:
-    listening = _listen(settings.host, settings.port)
+    listening = listen_tcp(settings.host, settings.port)
     server = _Uvicorn(
         uvicorn.Config(
             application,
@@ -186,26 +197,21 @@ async def _http(
 @asynccontextmanager
 async def _streams(settings: Settings, sockets: Sockets) -> AsyncIterator[dict[str, str]]:
     addresses: dict[str, str] = {}
-    servers: list[asyncio.Server] = []
-    loop = asyncio.get_running_loop()
+    acceptors: list[Acceptor] = []
     try:
         if settings.tcp_port is not None:
-            listening = _listen(settings.host, settings.tcp_port)
-            tcp = partial(StreamSocket, sockets, "tcp")
-            servers.append(await loop.create_server(tcp, sock=listening, backlog=_BACKLOG))
+            listening = listen_tcp(settings.host, settings.tcp_port)
+            acceptors.append(Acceptor(listening, partial(StreamSocket, sockets, "tcp")))
             addresses["tcp"] = f"tcp://{_host(settings.host)}:{listening.getsockname()[1]}"
         if settings.uds is not None:
-            unix = partial(StreamSocket, sockets, "unix")
-            path = str(settings.uds)  # uvloop takes no Path here
-            servers.append(await loop.create_unix_server(unix, path, backlog=_BACKLOG))
+            acceptors.append(Acceptor(listen_unix(settings.uds), partial(StreamSocket, sockets, "unix")))
             addresses["unix"] = f"unix://{settings.uds.absolute()}"
         yield addresses
     finally:
-        for server in servers:
-            server.close()
+        for acceptor in acceptors:
+            acceptor.close()
+            await acceptor.wait_closed()
         await sockets.drain(settings.drain_s)
-        for server in servers:
-            await server.wait_closed()
         if settings.uds is not None and "unix" in addresses:
             settings.uds.unlink(missing_ok=True)
 
@@ -224,22 +230,6 @@ async def _sweeping(handlers: Handlers, worker: Worker, every_s: float) -> Async
         sweeping.cancel()
         with suppress(asyncio.CancelledError):
             await sweeping
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    """A listening socket that says it is TCP: asyncio turns Nagle's algorithm off only for those, 40 ms an answer."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BYTES)  # and of all that are accepted
-        listening.bind((host, port))
-        listening.listen(_BACKLOG)
-    except OSError:
-        listening.close()
-        raise
-    listening.setblocking(False)
-    return listening
 
 
 def _host(host: str) -> str:

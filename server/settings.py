@@ -63,7 +63,7 @@ class Settings:
     then depends on who asked at the same time, for some bundles."""
     idle_ttl_s: float = 60.0
     """A connection that is silent for this long ends, and its bots with it."""
-    frame_deadline_s: float = 3.0
+    frame_deadline_s: float = 2.0
     """A client has this long to send one whole request, and to take one whole reply."""
     stuck_after_s: float = 2.0
     """Not ready while one piece of the inference thread's work has been running for this long."""

@@ -49,10 +49,15 @@ def test_no_answers_are_no_misses() -> None:
 
 
 def test_each_figure_that_is_not_reached_is_named() -> None:
-    good = {"learned_pct": 99.5, "in_time_pct": 99.5, "refused_p99_ms": 3.0}
+    good = {"learned_pct": 99.5, "in_time_pct": 99.5, "refused_p50_ms": 0.5, "refused_p99_ms": 7.0}
     assert shortcomings({"loads": {"0.5": good, "2": {**good, "learned_pct": 50.0}}, "recovery_s": 1.9}, 8000.0) == []
-    nobody_refused = {"learned_pct": 98.0, "in_time_pct": 100.0, "refused_p99_ms": float("nan")}
+    nobody_refused = {
+        "learned_pct": 98.0,
+        "in_time_pct": 100.0,
+        "refused_p50_ms": float("nan"),
+        "refused_p99_ms": float("nan"),
+    }
     assert shortcomings({"loads": {"1": nobody_refused}, "recovery_s": 0.0}, 8000.0) == []
     assert len(shortcomings({"loads": {"0.5": nobody_refused}, "recovery_s": 0.0}, 8000.0)) == 1
-    bad = {"learned_pct": 50.0, "in_time_pct": 98.0, "refused_p99_ms": 5.0}
-    assert len(shortcomings({"loads": {"0.25": bad, "0.5": bad, "2": bad}, "recovery_s": 2.1}, 8000.0)) == 5
+    bad = {"learned_pct": 50.0, "in_time_pct": 98.0, "refused_p50_ms": 2.0, "refused_p99_ms": 9.0}
+    assert len(shortcomings({"loads": {"0.25": bad, "0.5": bad, "2": bad}, "recovery_s": 2.1}, 8000.0)) == 6

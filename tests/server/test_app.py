@@ -9,36 +9,22 @@ import pytest
 
 from protocol.errors import BadBundle
 from server import app
-from server.app import _SEND_BYTES, _listen, running
+from server.app import running
+from server.listening import listen_tcp
 from server.observation import Observation, watch
 from server.settings import Settings
 from server.sockets import Sockets
-
-
-@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
-def test_listening_sockets_say_that_they_are_tcp(host: str) -> None:
-    """asyncio turns Nagle's algorithm off only for sockets accepted from such."""
-    with _listen(host, 0) as listening:
-        assert listening.proto == socket.IPPROTO_TCP
-
-
-def test_what_a_client_does_not_take_is_bounded_in_the_system_too() -> None:
-    with _listen("127.0.0.1", 0) as listening, socket.create_connection(listening.getsockname()):
-        listening.setblocking(True)
-        accepted, _ = listening.accept()
-        with accepted:
-            assert accepted.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) <= 2 * _SEND_BYTES  # Linux doubles it
 
 
 def test_http_and_tcp_listen_on_such_sockets(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ports: list[int] = []
 
     def listen(host: str, port: int) -> socket.socket:
-        listening = _listen(host, port)
+        listening = listen_tcp(host, port)
         ports.append(listening.getsockname()[1])
         return listening
 
-    monkeypatch.setattr(app, "_listen", listen)
+    monkeypatch.setattr(app, "listen_tcp", listen)
 
     async def main() -> list[int]:
         async with running(Settings(bundle=bundle, port=0, tcp_port=0)) as addresses:
