@@ -59,7 +59,7 @@ class CClient:
 
     def __enter__(self) -> Self:
         try:
-            self.call("connect", *self._how)
+            self.connect()
         except BaseException:
             self.__exit__()
             raise
@@ -82,6 +82,10 @@ class CClient:
             code, detail, retry = words or ("", "", "-1")
             raise Refused(status, bytes.fromhex(code).decode(), bytes.fromhex(detail).decode(), float(retry))
         return words
+
+    def connect(self) -> None:
+        """Dial, after what was there was closed."""
+        self.call("connect", *self._how)
 
     def hello(
         self,

@@ -60,26 +60,27 @@ def are_same(ours: Turn, theirs: Queries | Actions) -> bool:
     return (ours.rows, ours.numbers, ours.reasons, ours.late) == there
 
 
-def test_turns_are_those_of_the_python_client_bit_for_bit(pair: tuple[CClient, BotClient]) -> None:
+@pytest.mark.parametrize("n", [N, 40])
+def test_turns_are_those_of_the_python_client_bit_for_bit(pair: tuple[CClient, BotClient], n: int) -> None:
     ours, theirs = pair
-    started = {"seeds": [1, 2, 2**63 - 1], "target_returns": [10.0, 20.0, 30.5], "budgets_us": [3.0, 10.0, 18.0]}
-    bots, their_bots = ours.start(N, **started), theirs.start(N, **started)
+    started = {"seeds": [*range(n - 1), 2**63 - 1], "target_returns": np.arange(n) + 0.5, "budgets_us": np.arange(n)}
+    bots, their_bots = ours.start(n, **started), theirs.start(n, **started)
     n_asked = 0
     for frame in range(12):
-        told = {"free": free_numbers(TABLE, N, frame), "rewards": np.full(N, 0.1 * frame)}
+        told = {"free": free_numbers(TABLE, n, frame), "rewards": np.full(n, 0.1 * frame)}
         if frame % 4 == 1:
             told["frame_budget_us"] = 7.25
         if frame % 4 == 2:
-            told |= {"budgets_us": [18.0, 0.0, 4.5], "deadline_us": 1e9}
+            told |= {"budgets_us": np.arange(n)[::-1] + 1.5, "deadline_us": 1e9}
         query, their_query = ours.turn("query", bots, frame, **told), theirs.query(their_bots, frame, **told)
         assert are_same(query, their_query)
         asked, n_asked = their_query.queries, n_asked + int(their_query.queries.sum())
         failed = asked & (np.arange(asked.size).reshape(asked.shape) % 3 == 0) if frame % 3 == 2 else None
         found = {"acquired": asked if failed is None else asked & ~failed, "failed": failed}
-        found |= {"costly": costly_numbers(TABLE, N, frame), "acquire_us": 4.0 * frame}
+        found |= {"costly": costly_numbers(TABLE, n, frame), "acquire_us": 4.0 * frame}
         assert are_same(ours.turn("act", bots, frame, **found), theirs.act(their_bots, frame, **found))
-    assert n_asked > 20
-    assert ours.stop(bots[1:]) == N - 1
+    assert n_asked > 4 * n
+    assert ours.stop(bots[1:]) == n - 1
     ours.goodbye()
 
 
