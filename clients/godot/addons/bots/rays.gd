@@ -28,7 +28,7 @@ func setup(table: FeatureTable, class_names: Array) -> Dictionary:
 		var left = _number(parts[1], "l", "r")
 		var down = _number(parts[2], "d", "u")
 		var range_m = _number(parts[3], "r", "r")
-		if left == null or down == null or range_m == null or range_m > feature["high"]:
+		if left == null or down == null or range_m == null or range_m <= 0 or range_m > feature["high"]:
 			return _no_ray(feature)
 		left = deg2rad(left)
 		down = deg2rad(down)
