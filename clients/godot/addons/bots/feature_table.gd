@@ -8,6 +8,7 @@ const MAX_FEATURE_SIZE := 4096
 var features := []  # each {"name", "size", "cost_us", "low", "high"}
 var free := []  # those whose cost is 0: sent every frame
 var costly := []  # those that must be asked for; a query names them by their place in here
+var sizes := PoolIntArray()  # [M] of the costly ones
 var n_free := 0  # F
 var n_queries := 0  # M
 var n_costly := 0  # D
@@ -28,6 +29,7 @@ func read(listed) -> String:
 			n_free += each["size"]
 		else:
 			costly.append(each)
+			sizes.append(each["size"])
 			n_costly += each["size"]
 	n_queries = costly.size()
 	return ""

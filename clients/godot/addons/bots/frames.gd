@@ -26,7 +26,7 @@ func open(host: String, port: int) -> Dictionary:
 	return {"ok": true}
 
 
-# Begin to send a frame, and to wait for one of at most so many bytes. What came before it was asked for is no reply.
+# Send a frame as far as the socket lets, and wait for one of at most so many bytes. What came before it was asked for is no reply.
 func send(body: PoolByteArray, max_reply_bytes: int) -> Dictionary:
 	if state != IDLE:
 		return Errors.failure(Errors.CONNECTION_LOST, "the socket is not open")
@@ -42,7 +42,8 @@ func send(body: PoolByteArray, max_reply_bytes: int) -> Dictionary:
 	_in = PoolByteArray()
 	_max_reply_bytes = max_reply_bytes
 	state = SENDING
-	return {"ok": true}
+	var failed = _send_some()  # nearly always all of it
+	return failed if failed != null else {"ok": true}
 
 
 # Go on as far as the socket lets. Null: not done. {"ok": true, "body"}: the reply, or {"ok": true}: connected. A failure:

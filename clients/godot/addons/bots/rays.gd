@@ -14,6 +14,7 @@ var collision_mask := 0x7FFFFFFF
 var with_areas := true  # areas are hit too: lava and water that nobody stands on
 var _reach := []  # Vector3 of each costly feature: from the eye to the end of its ray, -z is ahead
 var _range_m := []
+var _one_hot := []  # PoolRealArray of each class
 
 
 # Take the costly features of a table. A failure names one that is no such ray: cast it yourself.
@@ -21,6 +22,12 @@ func setup(table: FeatureTable, class_names: Array) -> Dictionary:
 	classes = class_names
 	_reach = []
 	_range_m = []
+	_one_hot = []
+	for kind in range(classes.size()):
+		var row := []
+		for other_kind in range(classes.size()):
+			row.append(float(kind == other_kind))
+		_one_hot.append(PoolRealArray(row))
 	for feature in table.costly:
 		var parts: PoolStringArray = feature["name"].split("_")
 		if parts.size() != 4 or parts[0] != "ray" or feature["size"] != 1 + classes.size():
@@ -50,8 +57,7 @@ func cast(space: PhysicsDirectSpaceState, eye: Transform, asked: PoolIntArray, e
 		else:
 			values.append(min(eye.origin.distance_to(hit["position"]), _range_m[feature]))
 			kind = _class_of(hit["collider"])
-		for i in range(classes.size()):
-			values.append(1.0 if i == kind else 0.0)
+		values.append_array(_one_hot[kind])
 	return values
 
 
