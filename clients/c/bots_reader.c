@@ -80,7 +80,7 @@ static int next_number(botsp_reader *reader, uint8_t head, botsp_item *item)
 
 static int with_bytes(botsp_reader *reader, botsp_kind kind, uint64_t length, botsp_item *item)
 {
-    if (length > (uint64_t)(reader->end - reader->at))
+    if (length > (uint64_t)(reader->end - reader->at)) /* before it is narrowed to size_t, which may have 32 bits */
         return 0;
     item->kind = kind;
     item->length = (size_t)length;

@@ -107,6 +107,19 @@ def test_fields_and_codes_of_a_newer_server_and_of_an_older_one(built: Path) -> 
     assert len(heard) == 1
 
 
+def test_a_connection_that_has_ended_at_the_server_has_ended_here_and_hello_begins_another(built: Path) -> None:
+    ended = frame_of({"type": "error", "code": "NO_CONNECTION", "detail": "silent for too long"})
+    sockets = [WELCOME, ended], [WELCOME, QUERIES]
+    with scripted(*sockets) as (port, _), CClient(built, f"tcp://127.0.0.1:{port}") as client:
+        client.hello()
+        for code in ("NO_CONNECTION", ""):  # the server's first, then this side's own
+            with pytest.raises(Refused, match="NO_CONNECTION") as refusal:
+                client.turn("query", BOTS, 7, free=FREE)
+            assert refusal.value.code == code
+        client.hello()
+        assert client.turn("query", BOTS, 7, free=FREE).infer_us == 80.25
+
+
 def test_arguments_that_cannot_be_sent_are_not(built: Path) -> None:
     for url in ("", "http://127.0.0.1:1", "tcp://host", "tcp://:1", "tcp://h:0", "tcp://h:65536", "tcp://h:1/x",
                 "tcp://[::1", "unix://s", "unix:///" + "x" * 200):  # fmt: skip

@@ -6,6 +6,7 @@ import random
 import struct
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import pytest
@@ -48,38 +49,44 @@ def letters(built: Path, cases: list[tuple[str, bytes]], *, is_served: bool = Fa
 
 @pytest.mark.parametrize("name", BAD_FIELDS)
 def test_a_field_of_another_type_length_or_range_is_an_error(name: str, built: Path) -> None:
-    wrong = [plain(name, **{field: value}) for field, values in BAD_FIELDS[name].items() for value in values]
+    wrong = [  # each last in its message, so that nothing follows it that could be read for it
+        {**without(name, field), field: value} for field, values in BAD_FIELDS[name].items() for value in values
+    ]
     wrong += [without(name, field) for field in ("frame", "infer_us", name)]
     wrong += [plain("actions", actions=blob) for blob in BAD_ACTIONS] if name == "actions" else []
     assert set(letters(built, [(ASKED[name], msgpack.packb(message)) for message in wrong])) == {"x"}
 
 
+def serving(*table: dict[str, Any]) -> dict[str, Any]:
+    """The golden welcome, but of these features, and with as many costs as they need."""
+    costs = [1.0 for feature in table if feature["cost_us"] != 0.0]
+    return plain("welcome", features={"features": table}, cost_model={"call_us": 0.0, "feature_us": costs})
+
+
 def test_a_welcome_is_held_to_what_the_protocol_allows(built: Path) -> None:
     feature, component = plain("welcome")["features"]["features"][1], plain("welcome")["action"]["components"][0]
-    many = [{**feature, "name": f"ray_{i}"} for i in range(1025)]
-    tables = [
-        [],
-        many,
-        [feature, feature],
-        [{**feature, "size": 0}],
-        [{**feature, "size": 4097}],
-        [{**feature, "size": 1.0}],
-    ]
-    tables += [[{**feature, field: value}] for field in ("low", "high") for value in (1e39, float("nan"), None)]
-    tables += [[{**feature, "cost_us": value}] for value in (-1.0, float("nan"), 1e7)]
-    tables += [[{**feature, "name": value}] for value in ("", "x" * 65, "a b", "a-b", "1a", "é", 1)]
+    free = [{**feature, "name": f"free_{i}", "cost_us": 0.0} for i in range(1025)]
+    right = [serving(feature), serving(*free[:-1]), serving({**feature, "size": 4096}), plain("welcome", max_bots=0)]
+    bad = {
+        "size": [0, 4097, 1.0, None],
+        "low": [1e39, float("nan"), None, feature["high"]],
+        "high": [-1e39, float("inf"), feature["low"]],
+        "cost_us": [-1.0, float("nan"), 1e7],
+        "name": ["", "x" * 65, "a b", "a-b", "1a", "é", 1],
+    }
+    wrong = [serving(), serving(*free), serving(feature, feature)]
+    wrong += [serving({**feature, field: value}) for field, values in bad.items() for value in values]
+    wrong += [serving({name: value for name, value in feature.items() if name != field}) for field in ("size", "low")]
     actions = [[], [component] * 1025, [{**component, "safe": 2.0}], [{**component, "low": 1.0}]]
-    costs = [{"call_us": 1.0}, {"call_us": -1.0, "feature_us": [1.0] * 10}, {"call_us": 0.0, "feature_us": [1.0] * 9}]
-    wrong = [plain("welcome", features={"features": table}) for table in tables]
     wrong += [plain("welcome", action={"components": each}) for each in actions]
+    costs = [{"call_us": 1.0}, {"call_us": -1.0, "feature_us": [1.0] * 10}, {"call_us": 0.0, "feature_us": [1.0] * 9}]
+    costs += [{"feature_us": [1.0] * 10}, {"call_us": 0.0, "feature_us": [-1.0] * 10}]
     wrong += [plain("welcome", cost_model=each) for each in (*costs, {}, None, [])]
     wrong += [plain("welcome", **{field: None}) for field in ("connection", "bundle", "max_bots", "budget_us")]
     wrong += [plain("welcome", **{field: "1"}) for field in ("target_cost_us", "deadline_us", "replay_frames")]
     wrong += [plain("welcome", connection="x" * 65), plain("welcome", bundle_sha256="x" * 65)]
-    bodies = [msgpack.packb(message) for message in wrong]
-    assert letters(built, [("h", VECTORS["welcome"].body), *(("h", body) for body in bodies)], is_served=True) == (
-        "." + "x" * len(bodies)
-    )
+    cases = [("h", VECTORS["welcome"].body), *(("h", msgpack.packb(message)) for message in (*right, *wrong))]
+    assert letters(built, cases, is_served=True) == "." * (1 + len(right)) + "x" * len(wrong)
 
 
 def is_well_formed(body: bytes) -> bool:
