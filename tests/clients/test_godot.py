@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import shutil
 import socket
 import struct
@@ -279,6 +280,12 @@ def play_scenario(address: str) -> dict[str, Any]:
     return {"count": n, "seeds": seeds, "budgets_us": BUDGETS_US, "errors_at": ERRORS_AT, "frames": frames}
 
 
+def loop_of_the_readme(address: str) -> str:
+    (code,) = re.findall(r"```gdscript\n(.*?)```", (ROOT / "clients" / "godot" / "README.md").read_text("utf-8"), re.S)
+    assert code.count("7777") == 1
+    return str(code.replace("7777", address.rpartition(":")[2]))
+
+
 @pytest.fixture(scope="module")
 def run(served: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Everything in one run of the engine: what the runner saw, and what the fake server was asked."""
@@ -299,6 +306,7 @@ def run(served: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]
             "said": {"port": golden.port, "messages": [sayable(name) for name in SAID]},
             "play": {"port": int(served.rpartition(":")[2]), **play_scenario(served)},
             "rays": rays_scenario(),
+            "loop": loop_of_the_readme(served),
         }
         (folder / "scenario.json").write_text(json.dumps(scenario), encoding="utf-8")
         runner = str(Path(__file__).parent / "godot" / "runner.gd")
@@ -309,7 +317,7 @@ def run(served: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]
     for line in (folder / "out.json").read_text("utf-8").splitlines():
         part, result = json.loads(line)
         seen.setdefault(part, []).append(result)
-    return {part: each[0] if part in ("refused_here", "play", "rays") else each for part, each in seen.items()}
+    return {part: each[0] if part in ("refused_here", "play", "rays", "loop") else each for part, each in seen.items()}
 
 
 def test_msgpack_reads_what_the_package_reads_and_refuses_what_it_refuses(run: dict[str, Any]) -> None:
@@ -395,6 +403,10 @@ def test_rays_are_cast_where_the_table_says(run: dict[str, Any]) -> None:
         assert row[0] == pytest.approx(distance_m, abs=0.05), name  # shapes have margins
         assert row[1:].tolist() == [float(each == kind) for each in CLASSES], name
     assert (rays["one"], rays["none"]) == (rows[1].tolist(), [])
+
+
+def test_the_loop_of_the_readme_plays(run: dict[str, Any]) -> None:
+    assert run["loop"] == {"frames": 5, "decided": 4}  # the fifth had only been asked
 
 
 def test_the_demo_plays_and_says_when_it_cannot(served: str, tmp_path: Path) -> None:
