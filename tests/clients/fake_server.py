@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import NamedTuple
 
-__all__ = ["Conversation", "FakeServer", "answering", "framed"]
+__all__ = ["Conversation", "FakeServer", "answering"]
 
 _PATIENCE_S = 20
 
@@ -25,10 +25,6 @@ class Conversation(NamedTuple):
 class FakeServer(NamedTuple):
     port: int
     asked: list[bytes]
-
-
-def framed(body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + body
 
 
 @contextmanager
