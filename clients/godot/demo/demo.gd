@@ -4,7 +4,8 @@ extends Spatial
 #   python -m server --bundle bundles/hard --tcp-port 8001
 #   godot3-server --path clients/godot --host=127.0.0.1 --port=8001 --bots=4 --decisions=30
 #
-# Ends with 0 when all decisions were made, with 1 where anything failed. No tick of the physics waits for the server.
+# With --measure=1 the server is told what casting took and keeps budgets by that, not by declared costs. Ends with 0
+# when all decisions were made, with 1 where anything failed. No tick of the physics waits for the server.
 
 const Arena = preload("arena.gd")
 const BotClient = preload("../addons/bots/bot_client.gd")
@@ -19,7 +20,7 @@ var _rays := Rays.new()
 var _walkers := []
 var _bots := []
 var _asked := []
-var _arguments := {"host": "127.0.0.1", "port": "8001", "bots": "4", "decisions": "30"}
+var _arguments := {"host": "127.0.0.1", "port": "8001", "bots": "4", "decisions": "30", "measure": "0"}
 var _frame := 0
 var _tick := 0
 var _spent_us := 0.0
@@ -98,12 +99,14 @@ func _cast(queries: Dictionary) -> Dictionary:
 	for i in range(_bots.size()):
 		var walker = _walkers[i]
 		values.append(_rays.cast(space, walker.eye(), queries["asked"][i], [walker]))
-	_cast_us += OS.get_ticks_usec() - began_usec
+	var took_us := OS.get_ticks_usec() - began_usec
+	_cast_us += took_us
 	_asked = queries["asked"]
 	for i in range(_bots.size()):
 		_n_rays += _asked[i].size()
 		_spent_us += queries["cost_us"][i]
-	return _client.begin_act(_bots, _frame, _asked, values)
+	var options := {"acquire_us": took_us} if _arguments["measure"] == "1" else {}
+	return _client.begin_act(_bots, _frame, _asked, values, options)
 
 
 func _walk_on(reply: Dictionary) -> void:
@@ -119,7 +122,7 @@ func _end(result: Dictionary) -> void:
 	var welcome = _client.welcome
 	if result["ok"]:
 		var turns := float(_frame * _bots.size())
-		print("%d bots, %d frames: %.1f rays a turn, %.1f us of a budget of %.1f by declared costs, %.1f us by this clock" % [
+		print("%d bots, %d frames: %.1f rays a turn, %.1f us charged of a budget of %.1f, %.1f us by this clock" % [
 			_bots.size(), _frame, _n_rays / turns, _spent_us / turns, welcome["budget_us"], _cast_us / turns])
 		print("%d replies were late" % _client.n_late)
 	else:

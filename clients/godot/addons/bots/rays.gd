@@ -64,7 +64,7 @@ func cast(space: PhysicsDirectSpaceState, eye: Transform, asked: PoolIntArray, e
 # The number after a letter: that of `plus`, or the negative of that of `minus`. Null where it is neither.
 static func _number(part: String, plus: String, minus: String):
 	var digits := part.substr(1)
-	if not digits.is_valid_integer() or not part[0] in [plus, minus]:
+	if digits.length() > 3 or not digits.is_valid_integer() or not part[0] in [plus, minus]:
 		return null
 	return float(digits) if part[0] == plus else -float(digits)
 
