@@ -100,7 +100,7 @@ func _read_replies(cases: Array) -> Array:
 		var reply := Replies.read(Forms.bytes(case["body"]), message, welcome)
 		if welcome == null:
 			welcome = reply
-		results.append({"ok": reply["ok"], "code": reply.get("code"), "detail": reply.get("detail")})
+		results.append({"ok": reply["ok"], "code": reply.get("code")})
 	return results
 
 

@@ -4,6 +4,8 @@ extends Reference
 
 const MAX_FEATURES := 1024
 const MAX_FEATURE_SIZE := 4096
+const MAX_COST_US := 1e6
+const MAX_NUMBER := 3.4028234663852886e38
 
 var features := []  # each {"name", "size", "cost_us", "low", "high"}
 var free := []  # those whose cost is 0: sent every frame
@@ -39,15 +41,25 @@ static func is_number(value) -> bool:
 	return typeof(value) == TYPE_INT or (typeof(value) == TYPE_REAL and not is_nan(value) and not is_inf(value))
 
 
-static func _is_feature(each) -> bool:
-	if typeof(each) != TYPE_DICTIONARY or typeof(each.get("name")) != TYPE_STRING or typeof(each.get("size")) != TYPE_INT:
+# A name as PROTOCOL.md's tables have them: up to 64 of a-z, 0-9 and _, a letter first.
+static func is_name(value) -> bool:
+	if typeof(value) != TYPE_STRING or value.length() > 64 or not value.is_valid_identifier():
 		return false
-	for name in ["cost_us", "low", "high"]:
-		if not is_number(each.get(name)):
-			return false
-	return (
-		each["size"] >= 1
-		and each["size"] <= MAX_FEATURE_SIZE
-		and each["cost_us"] >= 0
-		and each["low"] < each["high"]
-	)
+	return value == value.to_lower() and value[0] != "_"
+
+
+# Whether two limits are finite as float32, and increasing.
+static func is_range(low, high) -> bool:
+	return is_number(low) and is_number(high) and -MAX_NUMBER <= low and low < high and high <= MAX_NUMBER
+
+
+static func is_cost(value) -> bool:
+	return is_number(value) and value >= 0 and value <= MAX_COST_US
+
+
+static func _is_feature(each) -> bool:
+	if typeof(each) != TYPE_DICTIONARY or typeof(each.get("size")) != TYPE_INT or not is_name(each.get("name")):
+		return false
+	if each["size"] < 1 or each["size"] > MAX_FEATURE_SIZE:
+		return false
+	return is_cost(each.get("cost_us")) and is_range(each.get("low"), each.get("high"))

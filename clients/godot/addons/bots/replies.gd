@@ -76,14 +76,21 @@ static func _welcome(reply: Dictionary) -> Dictionary:
 	for each in components:
 		if not _is_component(each):
 			return _bad("no component of an action: %s" % str(each).left(80))
-	var feature_us = reply["cost_model"].get("feature_us")
-	if not _are_numbers(feature_us, table.n_queries) or not FeatureTable.is_number(reply["cost_model"].get("call_us")):
+	if not _is_cost_model(reply["cost_model"], table.n_queries):
 		return _bad("welcome.cost_model is none for %d costly features" % table.n_queries)
-	if typeof(reply.get("max_body_bytes")) != TYPE_INT or not FeatureTable.is_number(reply.get("budget_us")):
-		return _bad("welcome has no max_body_bytes or no budget_us")
-	for name in ["deadline_us", "target_cost_us", "cost_quantile", "target_return"]:
+	for name in ["connection", "bundle"]:
+		if typeof(reply.get(name)) != TYPE_STRING:
+			return _bad("welcome.%s is no text" % name)
+	for name in ["max_body_bytes", "max_bots", "context_length"]:
+		if typeof(reply.get(name)) != TYPE_INT:
+			return _bad("welcome.%s is no int" % name)
+	for name in ["budget_us", "deadline_us", "target_cost_us", "cost_quantile", "target_return"]:
 		if reply.get(name) != null and not FeatureTable.is_number(reply[name]):
 			return _bad("welcome.%s is no number" % name)
+	if reply.get("budget_us") == null:
+		return _bad("welcome has no budget_us")
+	if not _is_version(reply) or not typeof(reply.get("replay_frames")) in [TYPE_NIL, TYPE_INT]:
+		return _bad("welcome's bundle_version, bundle_sha256 or replay_frames is none")
 	var welcome := reply.duplicate()  # what a newer server says beyond is kept too
 	welcome["ok"] = true
 	welcome["table"] = table
@@ -92,10 +99,18 @@ static func _welcome(reply: Dictionary) -> Dictionary:
 
 
 static func _is_component(each) -> bool:
-	if typeof(each) != TYPE_DICTIONARY or typeof(each.get("name")) != TYPE_STRING:
+	if typeof(each) != TYPE_DICTIONARY or not FeatureTable.is_name(each.get("name")):
 		return false
-	for name in ["low", "high", "safe"]:
-		if not FeatureTable.is_number(each.get(name)):
+	if not FeatureTable.is_range(each.get("low"), each.get("high")) or not FeatureTable.is_number(each.get("safe")):
+		return false
+	return each["low"] <= each["safe"] and each["safe"] <= each["high"]
+
+
+static func _is_cost_model(model: Dictionary, n_queries: int) -> bool:
+	if not _are_numbers(model.get("feature_us"), n_queries) or not FeatureTable.is_cost(model.get("call_us")):
+		return false
+	for us in model["feature_us"]:
+		if not FeatureTable.is_cost(us):
 			return false
 	return true
 
@@ -109,8 +124,15 @@ static func _bots_started(reply: Dictionary, count: int) -> Dictionary:
 				names[handle] = true
 	if typeof(bots) != TYPE_ARRAY or bots.size() != count or names.size() != count:
 		return _bad("bots_started has not %d different handles" % count)
+	if not _is_version(reply):
+		return _bad("bots_started's bundle_version or bundle_sha256 is none")
 	var version = reply.get("bundle_version")
 	return {"ok": true, "bots": bots, "bundle_version": version, "bundle_sha256": reply.get("bundle_sha256")}
+
+
+static func _is_version(reply: Dictionary) -> bool:
+	var is_number := typeof(reply.get("bundle_version")) in [TYPE_NIL, TYPE_INT]
+	return is_number and typeof(reply.get("bundle_sha256")) in [TYPE_NIL, TYPE_STRING]
 
 
 static func _queries(reply: Dictionary, count: int, table: FeatureTable) -> Dictionary:
@@ -132,7 +154,7 @@ static func _actions(reply: Dictionary, count: int, size: int) -> Dictionary:
 	if actions == null or reasons == null or reply.get("reasons") == null:
 		return _bad("actions has not finite actions and reasons of %d bots" % count)
 	var turns = reply.get("turns")
-	if (turns != null and not _are_numbers(turns, count)) or not FeatureTable.is_number(reply.get("infer_us")):
+	if (turns != null and not _are_ints(turns, count)) or not FeatureTable.is_number(reply.get("infer_us")):
 		return _bad("actions has no infer_us, or not turns of %d bots" % count)
 	return {
 		"ok": true, "frame": reply["frame"], "actions": actions, "reasons": reasons, "turns": turns,
@@ -149,6 +171,15 @@ static func _are_numbers(values, count: int) -> bool:
 		return false
 	for value in values:
 		if not FeatureTable.is_number(value):
+			return false
+	return true
+
+
+static func _are_ints(values, count: int) -> bool:
+	if not _are_numbers(values, count):
+		return false
+	for value in values:
+		if typeof(value) != TYPE_INT:
 			return false
 	return true
 
