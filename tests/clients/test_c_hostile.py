@@ -183,7 +183,7 @@ def test_a_reply_may_come_byte_by_byte(built: Path) -> None:
                     accepted.sendall(bytes([byte]))
 
     with socket.create_server(("127.0.0.1", 0)) as listening:
-        thread = threading.Thread(target=dribble, args=[listening])
+        thread = threading.Thread(target=dribble, args=[listening], daemon=True)
         thread.start()
         with CClient(built, f"tcp://127.0.0.1:{listening.getsockname()[1]}") as client:
             client.hello()
@@ -195,7 +195,7 @@ def test_where_memory_ends_nothing_else_does(built: Path) -> None:
     """The engine's allocator refuses from its first call on, from its second, and so on until nothing is refused."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         url = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
-        thread = threading.Thread(target=answer_forever, args=[listening])
+        thread = threading.Thread(target=answer_forever, args=[listening], daemon=True)
         thread.start()
         refusals = [refusal_of_a_turn(built, url, n_allowed) for n_allowed in range(20)]
         with socket.create_connection(listening.getsockname()) as last:
@@ -235,7 +235,7 @@ def test_mutated_frames_on_a_socket_are_errors_and_the_next_connection_works(bui
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(str(tmp_path / "s"))
         listening.listen()
-        thread = threading.Thread(target=answer_each, args=[listening, frames])
+        thread = threading.Thread(target=answer_each, args=[listening, frames], daemon=True)
         thread.start()
         statuses = []
         with CClient(built, f"unix://{tmp_path}/s") as client:
