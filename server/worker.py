@@ -35,7 +35,9 @@ class Worker:
         self._busy_since_s: float | None = None
         self._taken = 0  # jobs that were put into the queue: the event loop alone counts them
         self._done = 0  # jobs that have ended: the thread alone counts them
-        self._expected_us: deque[float] = deque()  # what each took or takes, of those that were put last
+        self._expected_us: deque[float] = (
+            deque()
+        )  # of what runs or waits, after what has ended lately
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="inference", daemon=True)
         self._thread.start()
@@ -58,8 +60,7 @@ class Worker:
     @property
     def backlog_us(self) -> float:
         """How long it will take for all that runs or waits here to be done, by what was expected of it."""
-        while len(self._expected_us) > self.n_waiting:
-            self._expected_us.popleft()
+        self._forget_done()
         if not self._expected_us:
             return 0.0
         return sum(self._expected_us) - min(1e6 * self.busy_s(), self._expected_us[0])
@@ -87,9 +88,14 @@ class Worker:
             _log.error("a job did not end within %g s", timeout_s)
 
     def _put(self, job: _Job, expected_us: float) -> None:
+        self._forget_done()
         self._expected_us.append(expected_us)
         self._taken += 1
         self._jobs.put(job)
+
+    def _forget_done(self) -> None:
+        while len(self._expected_us) > self.n_waiting:
+            self._expected_us.popleft()
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:

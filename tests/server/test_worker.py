@@ -115,3 +115,18 @@ def test_the_backlog_is_what_was_expected_of_all_that_is_not_done() -> None:
             worker.close()
 
     asyncio.run(main())
+
+
+def test_what_ended_jobs_were_expected_to_take_is_forgotten_though_nobody_asks_for_the_backlog() -> None:
+    """A number a job, kept for good, is a leak that only hours show."""
+
+    async def main() -> None:
+        worker = Worker(max_queue=1)
+        try:
+            for _ in range(100):
+                await worker.run(int, 5.0)
+            assert len(worker._expected_us) == 1
+        finally:
+            worker.close()
+
+    asyncio.run(main())
