@@ -35,9 +35,7 @@ class Worker:
         self._busy_since_s: float | None = None
         self._taken = 0  # jobs that were put into the queue: the event loop alone counts them
         self._done = 0  # jobs that have ended: the thread alone counts them
-        self._expected_us: deque[float] = (
-            deque()
-        )  # of what runs or waits, after what has ended lately
+        self._expected_us: deque[float] = deque()  # of what runs or waits, after what has ended lately
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="inference", daemon=True)
         self._thread.start()
