@@ -115,12 +115,13 @@ class TrainConfig:
 
     @property
     def dataset_name(self) -> str:
-        """`hopper-expert-v0`; with `hopper-medium-v0` it is `hopper-medium-expert-v0`, as D4RL calls them."""
+        """`hopper-expert-v0`; with `hopper-medium-v0` it is `hopper-medium-expert-v0`, as D4RL calls them, and with more
+        of the same quality, from another folder, it stays what it is."""
         names = [path.name for path in (self.dataset, *self.more_datasets)]
         matches = [DATASET_NAME.fullmatch(name) for name in names]
         if len(names) == 1 or not all(matches) or len({match["map"] for match in matches if match}) > 1:
             return "+".join(names)
-        qualities = sorted((match["quality"] for match in matches if match), reverse=True)
+        qualities = sorted({match["quality"] for match in matches if match}, reverse=True)
         return "-".join([names[0].partition("-")[0], *qualities, names[0].rpartition("-")[2]])
 
     @property

@@ -51,6 +51,7 @@ def test_a_series_is_a_method_and_what_is_not_as_printed(
         ("hard-expert-v0", {}, Setting("hard", "expert")),
         ("d4rl_halfcheetah", {}, Setting("", "d4rl_halfcheetah")),
         ("hopper-expert-v0", {"more_datasets": (Path("hopper-medium-v0"),)}, Setting("hopper", "medium-expert")),
+        ("hard-expert-v0", {"more_datasets": (Path("kicked/hard-expert-v0"),)}, Setting("hard", "expert")),
         ("hopper-expert-v0", {"more_datasets": (Path("mine"),)}, Setting("", "hopper-expert-v0+mine")),
         ("hopper-expert-v0", {"feature_map": Path("maps/hopper.json")}, Setting("hopper", "expert")),
         ("hopper-expert-v0", {"feature_map": Path("maps/hopper-nl.json")}, Setting("hopper", "expert", "nl")),
