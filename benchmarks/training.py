@@ -79,9 +79,9 @@ def _ways(config: TrainConfig, state: TrainState, costs_M: torch.Tensor) -> dict
     def loss(sampled: Rollout, drawn: Drawn) -> torch.Tensor:
         batch = drawn.batch
         penalised = Control.of("algorithm-1", 1.0, 1).penalty(
-            query_cost(sampled.query_BTM, costs_M), drawn.target_B, drawn.stratum_B, batch.valid_BT
+            query_cost(sampled.query_BTM, costs_M), drawn.target_B, drawn.stratum_B, drawn.counted_BT
         )
-        delta = action_loss(model.action_head.losses(sampled.hidden_BTW, batch.actions_BTA), batch.valid_BT)
+        delta = action_loss(model.action_head.losses(sampled.hidden_BTW, batch.actions_BTA), drawn.counted_BT)
         return delta + penalised
 
     def sequential(drawn: Drawn) -> torch.Tensor:

@@ -56,6 +56,7 @@ class TrainConfig:
 
     context_length: int = 20  # K
     window: int = 60  # timesteps in a training window
+    burn_in: int = 0  # first timesteps of a window that teach nothing: its memory has yet to fill (not where it begins)
     beginnings: float = 0.0  # share of the windows that start where their episode does: rare states, met in each one
     width: int = 64  # W
     n_layers: int = 2  # L; hidden layers of width W where there is no memory
@@ -93,6 +94,8 @@ class TrainConfig:
             raise ValueError(f"bins is {self.bins}, expected 2 or more for each action component, or none at all")
         if self.sampled and not self.bins:
             raise ValueError(f"sampled is {self.sampled}, expected none: only bins can be sampled")
+        if not 0 <= self.burn_in < self.window or (self.burn_in and self.method != "bdt"):
+            raise ValueError(f"burn_in is {self.burn_in}, expected 0 or more, below window, and 0 without a memory")
         if self.width % self.n_heads:
             raise ValueError(f"width {self.width} is not a multiple of n_heads {self.n_heads}")
         if self.n_kv_heads is not None and (self.n_kv_heads < 1 or self.n_heads % self.n_kv_heads):
@@ -115,8 +118,8 @@ class TrainConfig:
 
     @property
     def dataset_name(self) -> str:
-        """`hopper-expert-v0`; with `hopper-medium-v0` it is `hopper-medium-expert-v0`, as D4RL calls them, and with more
-        of the same quality, from another folder, it stays what it is."""
+        """`hopper-expert-v0`; with `hopper-medium-v0` it is `hopper-medium-expert-v0`, as D4RL calls them, and with
+        more of the same quality, from another folder, it stays what it is."""
         names = [path.name for path in (self.dataset, *self.more_datasets)]
         matches = [DATASET_NAME.fullmatch(name) for name in names]
         if len(names) == 1 or not all(matches) or len({match["map"] for match in matches if match}) > 1:

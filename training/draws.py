@@ -25,7 +25,7 @@ class Whole(NamedTuple):
 
     target_B: Tensor  # C of each window
     stratum_B: Tensor  # and which γ it has
-    valid_BT: Tensor
+    counted_BT: Tensor
     last_BT: Tensor
 
 
@@ -37,6 +37,7 @@ class Drawn:
     target_B: Tensor
     stratum_B: Tensor
     uniforms_BTM: Tensor
+    counted_BT: Tensor  # 1 at the timesteps that teach: not padding, nor burnt in
     whole: Whole
 
 
@@ -53,9 +54,9 @@ def draw(config: TrainConfig, traces: Traces, chance: np.random.Generator, rows:
     if config.budgets:
         drawn = draw_costs(config.budgets, config.batch // together, chance)
         targets, strata = (part.repeat(together) for part in drawn)
-    known = (torch.from_numpy(targets), torch.from_numpy(strata), windows.valid_BT, windows.last_BT)
+    known = (torch.from_numpy(targets), torch.from_numpy(strata), windows.counted_BT(config.burn_in), windows.last_BT)
     whole = Whole(*(part.to(config.device) for part in known))
-    return Drawn(batch, whole.target_B[rows], whole.stratum_B[rows], uniforms, whole)
+    return Drawn(batch, whole.target_B[rows], whole.stratum_B[rows], uniforms, whole.counted_BT[rows], whole)
 
 
 def draw_share(config: TrainConfig, traces: Traces, chance: np.random.Generator) -> Drawn:

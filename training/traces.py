@@ -104,6 +104,11 @@ class Windows(NamedTuple):
         """0 past an episode's end."""
         return torch.from_numpy((self.step_BT < self.length_B[:, None]).astype(np.float32))
 
+    def counted_BT(self, burn_in: int) -> Tensor:
+        """0 past an episode's end, and at the first `burn_in` timesteps of a window that starts within an episode."""
+        burnt_T = np.arange(self.step_BT.shape[1]) < burn_in
+        return self.valid_BT * torch.from_numpy(~(burnt_T & (self.step_BT[:, :1] > 0)))
+
     @property
     def last_BT(self) -> Tensor:
         """1 at an episode's last timestep."""

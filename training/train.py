@@ -114,26 +114,27 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tens
     is the run that was stopped."""
     model, control = state.model, state.control
     drawn = draw_share(config, traces, np.random.default_rng([config.seed, state.done]))
-    valid_BT, whole = drawn.batch.valid_BT, drawn.whole
+    counted_BT, valid_BT, whole = drawn.counted_BT, drawn.batch.valid_BT, drawn.whole
     state.optimiser.zero_grad(set_to_none=True)
     weight_BT = _critics_update(state, drawn)
     sampled, losses_BT, passes = state.forward(drawn)
     losses_BT = losses_BT * (drawn.batch.weight_BT if weight_BT is None else drawn.batch.weight_BT * weight_BT)
     cost_BT = _asked_cost(sampled, drawn, costs_M)
     # γφ depends on the queries alone, so it moves the acquisition path and leaves the action head as it is.
-    penalised = control.penalty(cost_BT, drawn.target_B, drawn.stratum_B, valid_BT)
-    loss = workers.weigh(valid_BT, whole.valid_BT) * (action_loss(losses_BT, valid_BT) + penalised)
+    # While its memory fills a network pays what it pays elsewhere, or it would ask for all then; γ moves by the rest.
+    penalised = control.penalty(cost_BT, drawn.target_B, drawn.stratum_B, valid_BT) * valid_BT.sum() / counted_BT.sum()
+    loss = workers.weigh(counted_BT, whole.counted_BT) * (action_loss(losses_BT, counted_BT) + penalised)
     backward(sampled, loss, config.sweeps if model.config.has_memory else 1, list(model.parameters()))
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, state.done)
     state.optimiser.step()
     cost_BT, losses_BT = workers.gather(torch.stack([cost_BT, losses_BT], dim=-1).detach()).unbind(-1)
-    spent = Spent(cost_BT, whole.target_B, whole.stratum_B, whole.valid_BT)
+    spent = Spent(cost_BT, whole.target_B, whole.stratum_B, whole.counted_BT)
     if config.acquisition == "learned":
         control.observe(*spent)
     state.done += 1
-    delta, n_strata = action_loss(losses_BT, whole.valid_BT).item(), max(len(config.budgets) - 1, 0)
+    delta, n_strata = action_loss(losses_BT, whole.counted_BT).item(), max(len(config.budgets) - 1, 0)
     state.metrics = {"delta": delta, **spent.means(n_strata), "passes": float(passes), "gradient_norm": float(norm)}
     state.metrics |= control.means()
 
@@ -155,9 +156,9 @@ def _critics_update(state: TrainState, drawn: Drawn) -> Tensor | None:
         everything = torch.cat([context, model.normalise_costly(batch.costly_BTD)], dim=-1)
     state.critic_optimiser.zero_grad(set_to_none=True)
     togo_BT = batch.returns_to_go_BT1[..., 0]
-    value_loss, q_loss = state.judge(everything, batch.actions_BTA, togo_BT, batch.last_BT, batch.valid_BT)
-    value_weight = workers.weigh(batch.valid_BT, whole.valid_BT)
-    q_weight = workers.weigh(taught(batch.last_BT, batch.valid_BT), taught(whole.last_BT, whole.valid_BT))
+    value_loss, q_loss = state.judge(everything, batch.actions_BTA, togo_BT, batch.last_BT, drawn.counted_BT)
+    value_weight = workers.weigh(drawn.counted_BT, whole.counted_BT)
+    q_weight = workers.weigh(taught(batch.last_BT, drawn.counted_BT), taught(whole.last_BT, whole.counted_BT))
     (value_weight * value_loss + q_weight * q_loss).backward()
     state.critic_optimiser.step()
     critics.follow()
@@ -168,7 +169,7 @@ def _critics_update(state: TrainState, drawn: Drawn) -> Tensor | None:
 def held_out_loss(forward: Pass, drawn: Drawn) -> float:
     """Δ on episodes that are not trained on."""
     _, losses_BT, _ = forward(drawn)
-    return action_loss(losses_BT, drawn.batch.valid_BT).item()
+    return action_loss(losses_BT, drawn.counted_BT).item()
 
 
 def train(config: TrainConfig) -> TrainState:

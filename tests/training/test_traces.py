@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from tests.training import toy
 from training.datasets import TracesError
 from training.steps import returns_to_go
-from training.traces import load_traces
+from training.traces import choose_windows, load_traces
 
 
 @given(st.lists(st.floats(-100, 100), min_size=1, max_size=30))
@@ -50,6 +50,16 @@ def test_windows_stay_inside_their_episode_and_mark_padding(dataset: Path) -> No
         assert ((clock[:, 1:] - clock[:, :-1] == 1) | ~valid[:, 1:]).all()
         starts |= set(clock[:, 0].tolist())
     assert {0.0, 1.0} <= starts, "windows must begin at an episode's start as well as inside it"
+
+
+@given(st.integers(0, 11))
+def test_a_window_within_an_episode_counts_from_its_burn_in_on(dataset: Path, burn_in: int) -> None:
+    windows = choose_windows(load_traces(dataset), 64, 12, np.random.default_rng(burn_in))
+    for step_T, length, counted_T in zip(
+        windows.step_BT, windows.length_B, windows.counted_BT(burn_in).bool().tolist(), strict=True
+    ):
+        first = 0 if step_T[0] == 0 else burn_in
+        assert counted_T == [first <= t and step < length for t, step in enumerate(step_T)]
 
 
 def test_held_out_episodes_are_never_drawn(dataset: Path) -> None:

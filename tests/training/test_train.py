@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,8 +16,10 @@ from training.acquisition import rollout, sample_queries
 from training.build import build_model
 from training.checkpoint import load_trained
 from training.config import TrainConfig
-from training.traces import load_traces
-from training.train import TrainState, main, train
+from training.draws import draw_share
+from training.objectives import query_cost
+from training.traces import Traces, choose_windows, load_traces
+from training.train import TrainState, main, new_state, train, update
 
 
 def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Path, TrainState]) -> None:
@@ -94,6 +98,39 @@ def test_a_conditioned_network_asks_for_more_where_it_may(dataset: Path, tmp_pat
     assert asked[1] > 1.2 * asked[0]
 
 
+def test_while_its_memory_fills_a_window_teaches_nothing_and_moves_no_weight_of_the_cost(
+    dataset: Path, tmp_path: Path
+) -> None:
+    config, traces = toy.config(dataset, tmp_path, burn_in=5, batch=4, control="dual"), load_traces(dataset)
+    windows = choose_windows(traces, 4, 12, np.random.default_rng([0, 0]))
+    index_BT, counted_BT = windows.first_B[:, None] + windows.step_BT, windows.counted_BT(5).bool().numpy()
+    taught = np.unique(index_BT[counted_BT])
+    burnt = np.setdiff1d(index_BT[windows.valid_BT.bool().numpy() & ~counted_BT], taught)
+    assert len(burnt) >= 5
+    as_recorded, other_burnt, other_taught = (
+        _updated(config, _pushed_otherwise(traces, steps)) for steps in ([], burnt, taught)
+    )
+    for name, value in as_recorded.model.state_dict().items():
+        assert torch.equal(value, other_burnt.model.state_dict()[name]), name
+    assert as_recorded.metrics["delta"] != other_taught.metrics["delta"]
+    drawn, fresh = draw_share(config, traces, np.random.default_rng([0, 0])), new_state(config, traces)
+    costs_M = torch.tensor(toy.FEATURES.costs_us, dtype=torch.float32)
+    cost_BT = query_cost(fresh.forward(drawn)[0].query_BTM.detach(), costs_M)
+    assert as_recorded.metrics["cost"] == pytest.approx(cost_BT[torch.from_numpy(counted_BT)].mean().item())
+
+
+def _pushed_otherwise(traces: Traces, steps: Sequence[int]) -> Traces:
+    actions_SA = traces.actions_SA.clone()
+    actions_SA[list(steps), 0] *= -1.0
+    return dataclasses.replace(traces, actions_SA=actions_SA)
+
+
+def _updated(config: TrainConfig, traces: Traces) -> TrainState:
+    state = new_state(config, traces)
+    update(config, state, traces, torch.tensor(toy.FEATURES.costs_us, dtype=torch.float32))
+    return state
+
+
 def train_interrupted(config: TrainConfig, after: int) -> None:
     """Ctrl-C in the middle of a run."""
     import training.train as room
@@ -141,6 +178,8 @@ def test_refuses_to_resume_with_other_settings(dataset: Path, tmp_path: Path) ->
         ("warmup", 0, "warmup is 0"),
         ("bins", (3, 1), "2 or more for each"),
         ("width", 15, "not a multiple"),
+        ("burn_in", 12, "burn_in is 12, expected 0 or more, below window"),
+        ("burn_in", -1, "burn_in is -1"),
         ("n_kv_heads", 3, "n_kv_heads is 3, expected 1 or more that divide n_heads 2"),
         ("n_kv_heads", 0, "n_kv_heads is 0"),
         ("context_length", 1, "2 or more"),
