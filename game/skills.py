@@ -1,13 +1,13 @@
-"""How well a scripted player sees and moves, and the two qualities that we record.
+"""How well a scripted player sees and moves, and the qualities that we record.
 
 This module knows nothing about how a player decides.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-__all__ = ["EXPERT", "INTERMEDIATE", "Skill"]
+__all__ = ["EXPERT", "INTERMEDIATE", "NEARSIGHTED", "Skill"]
 
 
 @dataclass(frozen=True)
@@ -28,4 +28,5 @@ class Skill:
 
 
 EXPERT = Skill("expert", 1.0, 0.6, 0.05, 0, 0.004, 3, 14.0, 0.0, 1.4, 0.5)
+NEARSIGHTED = replace(EXPERT, name="nearsighted", sight_m=5.0)  # as good, and acts on what short rays can tell
 INTERMEDIATE = Skill("intermediate", 0.8, 0.5, 0.25, 2, 0.03, 8, 9.0, 0.15, 0.3, 1.0)
