@@ -19,8 +19,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from game.env import ACTION_SPEC, feature_table
 from protocol.client import BotClient
 from protocol.replies import read_actions, read_bots_started, read_queries, read_reply, read_welcome
+from tests.bundles import make_bundle
 from tests.clients.fake_server import Conversation, answering
 from tests.clients.godot_cases import (
     CLASSES,
@@ -60,7 +62,9 @@ def godot(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The TCP address of a real server."""
-    with serve(ROOT / "bundles" / "hard", tmp_path_factory.mktemp("served") / "s") as served:
+    folder = tmp_path_factory.mktemp("served")
+    bundle = make_bundle(folder / "tiny", features=feature_table(), action=ACTION_SPEC, budget=0.2)
+    with serve(bundle, folder / "s") as served:
         yield served.addresses["tcp"]
 
 
