@@ -117,6 +117,8 @@ def test_while_its_memory_fills_a_window_teaches_nothing_and_moves_no_weight_of_
     costs_M = torch.tensor(toy.FEATURES.costs_us, dtype=torch.float32)
     cost_BT = query_cost(fresh.forward(drawn)[0].query_BTM.detach(), costs_M)
     assert as_recorded.metrics["cost"] == pytest.approx(cost_BT[torch.from_numpy(counted_BT)].mean().item())
+    fresh.control.observe(cost_BT, drawn.target_B, drawn.stratum_B, torch.from_numpy(counted_BT).float())
+    assert as_recorded.control.weights == pytest.approx(fresh.control.weights)
 
 
 def _pushed_otherwise(traces: Traces, steps: Sequence[int]) -> Traces:
