@@ -17,7 +17,7 @@ import shutil
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -31,7 +31,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from game.env import ACTION_SPEC, NavigationEnv
 from game.players import Kicks, Player
 from game.recording import Episode, Summary, merge_shards, summarise, write_shard
-from game.skills import EXPERT, INTERMEDIATE, NEARSIGHTED
+from game.skills import EXPERT, INTERMEDIATE, NEARSIGHTED, Skill
 
 __all__ = ["Collect", "collect", "dataset_id", "play_episode"]
 
@@ -50,6 +50,13 @@ class Collect:
     workers: int = os.cpu_count() or 1  # processes
     out: Path = Path("data/navigation")  # MINARI_DATASETS_PATH of the dataset
     kick_chance: float = 0.07  # per decision; a kick disturbs what is executed, not what is recorded
+    sight_m: float | None = None  # how far the player recognises bridges and pools (None: as its skill says)
+
+    @property
+    def skill(self) -> Skill:
+        """How well the player sees and moves."""
+        skill = _SKILLS[self.player]
+        return skill if self.sight_m is None else replace(skill, sight_m=self.sight_m)
 
 
 def main() -> None:
@@ -159,7 +166,7 @@ def _end_with_parent() -> None:
 
 def _play_shard(config: Collect, first: int, count: int, path: Path) -> None:
     env = NavigationEnv(config.map)
-    player = Player(_SKILLS[config.player], env.terrain)
+    player = Player(config.skill, env.terrain)
     seeds = range(config.seed * 1_000_000 + first, config.seed * 1_000_000 + first + count)
     write_shard(path, (play_episode(env, player, seed, config.kick_chance) for seed in seeds))
     env.close()
@@ -170,7 +177,7 @@ def _fingerprint(config: Collect) -> str:
     what = {key: str(value) for key, value in asdict(config).items() if key not in ("workers", "out")}
     env = NavigationEnv(config.map)
     what["terrain"] = msgspec.json.encode(env.terrain).decode()
-    what["skill"] = str(_SKILLS[config.player])
+    what["skill"] = str(config.skill)
     env.close()
     return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:12]
 
@@ -185,7 +192,7 @@ def _metadata(config: Collect, env: gymnasium.Env) -> dict[str, str]:
         "algorithm_name": f"scripted {config.player}",
         "collect": json.dumps({key: str(value) for key, value in asdict(config).items() if key != "out"}),
         "terrain": msgspec.json.encode(inner.terrain).decode(),
-        "skill": json.dumps(asdict(_SKILLS[config.player])),
+        "skill": json.dumps(asdict(config.skill)),
         "versions": json.dumps(versions),
         "minari_version": versions["minari"],
     }

@@ -22,6 +22,7 @@ from rich.progress import Progress
 
 from bot_runtime.bundle import Bundle
 from bot_runtime.manifest import Manifest
+from protocol.messages import MAX_RETURN
 from training.feature_map import FEATURE_MAP, FeatureMap
 from training.heat_map import HeatSums
 from training.play import Episode, Group, Player, Terms
@@ -40,6 +41,7 @@ class EvaluateConfig:
     episodes: int = 256
     seed: int = 1_000_000  # first episode's seed; the others follow it, none of them in the shipped traces
     target_cost: float | None = None  # C asked of a budget-conditioned bundle (None: the bundle's)
+    target_return: float | None = None  # return asked for at the start of an episode (None: the bundle's)
     budget: float | None = None  # hard cap of a bot's query; 1 is none (None: the bundle's, or 1 with a frame budget)
     frame_budget: float | None = None  # hard cap that all bots alive in a frame share, of their full cost (None: none)
     bots: int = 32  # most bots at once, as one batch
@@ -55,6 +57,8 @@ class EvaluateConfig:
             share = getattr(self, name)
             if share is not None and not 0.0 <= share <= 1.0:
                 raise ValueError(f"{name} is {share}, expected a share of the full cost in [0, 1]")
+        if self.target_return is not None and not abs(self.target_return) <= MAX_RETURN:
+            raise ValueError(f"target_return is {self.target_return}, expected at most {MAX_RETURN:g} either way")
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,7 @@ class Evaluation:
     trained_budget: float | None  # C that it was trained for (None: one network for every budget)
     train_seed: int | None
     target_cost: float | None  # C asked of the network (None: not conditioned)
+    target_return: float
     frame_budget: float | None  # shared by all bots alive in a frame (None: none)
     bots: int
     normalised_mean: float | None  # return_mean where the bundle's reference returns are 0 and 100
@@ -119,8 +124,16 @@ def _terms(config: EvaluateConfig, manifest: Manifest) -> Terms:
     budget = config.budget
     if budget is None:
         budget = manifest.budget if config.frame_budget is None else 1.0
-    with_heat_map = config.heat_map is not None
-    return Terms(config.bundle, environment, config.bots, budget, config.frame_budget, target_cost, with_heat_map)
+    return Terms(
+        bundle=config.bundle,
+        environment=environment,
+        bots=config.bots,
+        budget=budget,
+        frame_budget=config.frame_budget,
+        target_cost=target_cost,
+        target_return=config.target_return,
+        with_heat_map=config.heat_map is not None,
+    )
 
 
 _player: Player | None = None
@@ -180,6 +193,7 @@ def _summary(
         trained_budget=None if trained_budget == "conditioned" else float(trained_budget),
         train_seed=int(origin["seed"]) if "seed" in origin else None,
         target_cost=terms.target_cost,
+        target_return=manifest.target_return if terms.target_return is None else terms.target_return,
         frame_budget=terms.frame_budget,
         bots=terms.bots,
         normalised_mean=_normalised(float(returns.mean()), origin.get("reference_returns")),

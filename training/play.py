@@ -37,6 +37,7 @@ class Terms:
     budget: float  # hard cap of a bot's query; 1 is none
     frame_budget: float | None  # share of the live bots' full cost that they share each frame; None or 1: none
     target_cost: float | None  # C asked of the network; None: it is not conditioned
+    target_return: float | None  # asked for when an episode begins; None: the bundle's
     with_heat_map: bool
 
 
@@ -98,7 +99,11 @@ class Player:
     def _begin(self, bots: Bots, seed: int) -> _Game:
         target = self._terms.target_cost
         targets_us = None if target is None else [target * self._costs.full_us]
-        handle = bots.start(1, seeds=[seed], budgets_us=[self._budget_us], target_costs_us=targets_us)
+        asked = self._terms.target_return
+        returns = None if asked is None else [asked]
+        handle = bots.start(
+            1, seeds=[seed], target_returns=returns, budgets_us=[self._budget_us], target_costs_us=targets_us
+        )
         if not self._idle:
             owner_D = self._bundle.manifest.features.owner
             self._idle.append(open_environment(self._terms.environment, owner_D, self._feature_map))

@@ -1,5 +1,6 @@
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,10 +11,10 @@ import pytest
 from rich.console import Console
 
 from game.collect import Collect, collect, dataset_id, play_episode
-from game.env import ACTION_SPEC, feature_table
+from game.env import ACTION_SPEC, NavigationEnv, feature_table
 from game.players import Player
 from game.recording import summarise, write_shard
-from game.skills import EXPERT
+from game.skills import EXPERT, NEARSIGHTED
 from protocol.features import ActionSpec, FeatureTable
 
 
@@ -48,6 +49,16 @@ def test_minari_loads_what_was_recorded(recorded, monkeypatch):
     env = dataset.recover_environment()
     assert env.unwrapped.terrain.name == "easy"
     env.close()
+
+
+def test_a_player_sees_as_far_as_it_is_told():
+    assert Collect(player="nearsighted").skill == NEARSIGHTED
+    told = Collect(player="expert", sight_m=NEARSIGHTED.sight_m)
+    assert told.skill == replace(EXPERT, sight_m=NEARSIGHTED.sight_m)
+    env = NavigationEnv("hard")
+    near, far = (_recorded_actions(env, Collect(sight_m=sight_m)) for sight_m in (None, 2.0))
+    env.close()
+    assert near.shape != far.shape or not np.array_equal(near, far)
 
 
 def test_a_recorded_episode_starts_as_its_seed_does(recorded, easy):
@@ -116,3 +127,7 @@ def test_what_was_intended_is_recorded_not_what_a_kick_made_of_it(easy, monkeypa
     np.testing.assert_array_equal(episode.actions, np.stack(intended))
     kicked = (np.stack(executed) != episode.actions).any(axis=1)
     assert 0.05 < kicked.mean() < 0.9
+
+
+def _recorded_actions(env, config):
+    return play_episode(env, Player(config.skill, env.terrain), 7, config.kick_chance).actions

@@ -90,6 +90,17 @@ def test_a_conditioned_bundle_is_asked_for_its_own_target_cost_or_for_another(tm
     assert asked[None] == asked[0.25] != asked[0.9]
 
 
+def test_another_return_can_be_asked_for_than_the_bundles(tiny: Path) -> None:
+    config = EvaluateConfig(tiny, LINE, episodes=4, budget=1.0, workers=1)
+    own = json.loads((tiny / "manifest.json").read_text())["target_return"]
+    asked = {}
+    for target_return in (None, own, own + 50.0):
+        evaluation, _ = evaluate(dataclasses.replace(config, target_return=target_return))
+        asked[target_return] = evaluation.soft_cost_pct
+        assert evaluation.target_return == (own if target_return is None else target_return)
+    assert asked[None] == asked[own] != asked[own + 50.0]
+
+
 def test_a_target_cost_is_refused_by_a_bundle_that_is_not_conditioned(tiny: Path) -> None:
     with pytest.raises(ValueError, match=r"target_cost is 0.1, expected none: tiny is not conditioned"):
         evaluate(EvaluateConfig(tiny, LINE, target_cost=0.1))
@@ -121,6 +132,7 @@ def test_a_bundle_without_an_environment_needs_one(bundle: Path) -> None:
         {"budget": float("nan")},
         {"target_cost": -0.1},
         {"frame_budget": 1.01},
+        {"target_return": float("inf")},
     ],
 )
 def test_refuses_settings_that_cannot_be(settings: dict[str, float]) -> None:
