@@ -22,6 +22,8 @@ _VIEW_RAD = math.radians(75.0)
 _DOUBT_M = 12.0
 """An unseen crossing is planned over as if it were this much longer."""
 _DOUBTFUL_M = 5.0
+_LEVEL_M = 0.3
+"""Feet higher than this stand on a ledge, with eyes so high that rays of 5 and 10 m end above the ground."""
 _LEDGE_COST, _BRINK_COST = 1.5, 12.0
 
 
@@ -41,6 +43,8 @@ class Beliefs:
 
     def look(self, character: Character) -> bool:
         """Take in what has come into view; True when the belief changed."""
+        if self._skill.grounded and not (character.on_ground and character.z < _LEVEL_M):
+            return False
         changed = False
         for r, river in enumerate(self._terrain.rivers):
             for s, slot in enumerate(river.slots):

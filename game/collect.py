@@ -31,12 +31,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from game.env import ACTION_SPEC, NavigationEnv
 from game.players import Kicks, Player
 from game.recording import Episode, Summary, merge_shards, summarise, write_shard
-from game.skills import EXPERT, INTERMEDIATE, NEARSIGHTED, Skill
+from game.skills import EXPERT, GROUNDED, INTERMEDIATE, NEARSIGHTED, Skill
 
 __all__ = ["Collect", "collect", "dataset_id", "play_episode"]
 
 _SHARD_EPISODES = 25
-_SKILLS = {skill.name: skill for skill in (EXPERT, NEARSIGHTED, INTERMEDIATE)}
+_SKILLS = {skill.name: skill for skill in (EXPERT, NEARSIGHTED, GROUNDED, INTERMEDIATE)}
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Collect:
     """What to record, and where to."""
 
     map: str = "hard"  # easy, hard, or a map file of your own
-    player: Literal["expert", "nearsighted", "intermediate"] = "expert"
+    player: Literal["expert", "nearsighted", "grounded", "intermediate"] = "expert"
     episodes: int = 2500
     seed: int = 0  # episode i is played with seed * 1,000,000 + i
     workers: int = os.cpu_count() or 1  # processes

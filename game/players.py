@@ -94,9 +94,13 @@ class Player:
             self._pause = int(self._rng.integers(1, self.skill.pause_decisions, endpoint=True))
         if abs(error) > math.radians(75.0):
             return 0.2
-        if abs(error) > math.radians(40.0) or self._beliefs.doubtful(character):
+        if abs(error) > math.radians(40.0) or self._beliefs.doubtful(character) or self._on_blind_ledge(character):
             return self.skill.careful_speed
         return self.skill.speed
+
+    def _on_blind_ledge(self, character: Character) -> bool:
+        """Whether what lies behind a ledge is yet to be seen: before it, above it and in the air after it."""
+        return self.skill.grounded and (character.z > _ON_TOP_M or self._ledge_ahead(character))
 
     def _ledge_ahead(self, character: Character) -> bool:
         """Whether the way ahead soon meets a ledge that is higher than the feet: jump is held until over it."""

@@ -1,10 +1,13 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from game.beliefs import Beliefs
+from game.grid import Grid
 from game.players import Kicks, Player
-from game.skills import EXPERT, INTERMEDIATE, NEARSIGHTED, Skill
+from game.skills import EXPERT, GROUNDED, INTERMEDIATE, NEARSIGHTED, Skill
 
 
 def _returns(env, skill, seeds, kick_chance=0.1) -> list[float]:
@@ -25,9 +28,34 @@ def _returns(env, skill, seeds, kick_chance=0.1) -> list[float]:
     return totals
 
 
-@pytest.mark.parametrize(("skill", "least"), [(EXPERT, 95.0), (NEARSIGHTED, 90.0)])
+@pytest.mark.parametrize(("skill", "least"), [(EXPERT, 95.0), (NEARSIGHTED, 90.0), (GROUNDED, 85.0)])
 def test_experts_arrive_although_they_are_kicked(hard, skill: Skill, least: float):
     assert np.mean(_returns(hard, skill, range(20))) >= least
+
+
+@pytest.mark.parametrize(("on_ground", "z", "sees"), [(True, 0.0, True), (True, 0.6, False), (False, 0.1, False)])
+def test_a_grounded_player_sees_nothing_new_from_a_ledge_or_the_air(hard, on_ground: bool, z: float, sees: bool):
+    hard.restart(seed=0)
+    x0, y0, _, y1 = hard.layout.pools[0].rect
+    before = SimpleNamespace(x=x0 - 2.0, y=(y0 + y1) / 2, z=z, yaw=0.0, on_ground=on_ground)
+    for skill, expected in ((GROUNDED, sees), (NEARSIGHTED, True)):
+        beliefs = Beliefs(hard.terrain, Grid(hard.terrain), hard.layout, skill, np.random.default_rng(0))
+        assert beliefs.look(before) == expected
+
+
+def test_a_grounded_player_takes_ledges_carefully(hard):
+    hard.restart(seed=0)
+    player, who = Player(GROUNDED, hard.terrain), hard.world.character
+    player.start(hard.layout, np.random.default_rng(0))
+    aloft, over = [], False
+    while not over:
+        action = player.act(who)
+        if who.z > 0.3:
+            aloft.append(action[1])
+        _, terminated, truncated, _ = hard.advance(action)
+        over = terminated or truncated
+    assert aloft
+    assert max(aloft) <= np.float32(GROUNDED.careful_speed)
 
 
 def test_the_intermediate_is_worse_and_not_hopeless(hard):
