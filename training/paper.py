@@ -6,13 +6,13 @@ This module knows nothing about our own results.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from training.results import BASE, Constraint, Setting
 
-__all__ = ["PaperPoint", "PaperTable", "read_paper"]
+__all__ = ["PaperPoint", "PaperTable", "read_paper", "shown_beside"]
 
 _METHODS = {"bdt": "BDT", "rcbc": "RCBC"}
 _GROUPS = {"exact": "no_noise_pct", "low": "low_noise_pct", "high": "high_noise_pct"}
@@ -50,6 +50,17 @@ def read_paper(*paths: Path) -> PaperTable:
                 except (KeyError, TypeError, ValueError) as error:
                     raise ValueError(f"{path} line {rows.line_num}: {type(error).__name__} {error}") from error
     return table
+
+
+def shown_beside(table: PaperTable, dataset: str, settings: Iterable[Setting]) -> PaperTable:
+    """The table, with its figures of one dataset once more under those of our settings that it has nothing for: for
+    traces of players of our own, on the same map."""
+    known = {setting for setting, _, _ in table}
+    copied: PaperTable = {}
+    for ours in set(settings) - known:
+        theirs = ours._replace(dataset=dataset)
+        copied |= {(ours, *rest): point for (setting, *rest), point in table.items() if setting == theirs}
+    return table | copied
 
 
 def _reader(columns: object) -> Callable[[_Row], Iterator[tuple[_Key, PaperPoint]]]:

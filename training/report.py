@@ -20,7 +20,7 @@ from training.curves import training_figure
 from training.figures import LEAST_ALIVE, Panel, heat_map_figure, performance_figure
 from training.group_table import group_table
 from training.heat_map import HeatMap
-from training.paper import PaperTable, read_paper
+from training.paper import PaperTable, read_paper, shown_beside
 from training.results import Kind, Measurement, Results, Run, Setting
 from training.tables import cost_table, spend_table
 
@@ -43,6 +43,7 @@ class ReportConfig:
 
     results: tyro.conf.Positional[Path]  # folder of run folders
     paper: tuple[Path, ...] = ()  # tables of the paper as CSV (none: without the paper's figures)
+    paper_dataset: str = ""  # the paper's dataset shown beside ours of other names (empty: beside its namesake only)
     out: Path | None = None  # folder of report.md and figures/ (None: `report` in the folder of results)
     spends: tuple[float, ...] = (1.0, 2.0, 2.9, 5.0, 10.0)  # % of the full cost, for returns at equal spend
 
@@ -54,7 +55,7 @@ class ReportConfig:
 def report(config: ReportConfig) -> Path:
     """Write everything; the path of report.md. Raises ValueError naming a file that is not as it should be."""
     results = Results.read(config.results)
-    paper = read_paper(*config.paper)
+    paper = shown_beside(read_paper(*config.paper), config.paper_dataset, results.settings)
     out = config.out or config.results / "report"
     (out / "figures").mkdir(parents=True, exist_ok=True)
     parts = [_HEAD + (_PAPER if paper else "")]

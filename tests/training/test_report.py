@@ -15,7 +15,7 @@ from training.config import TrainConfig
 from training.curves import plot_curves
 from training.figures import Panel, heat_map_figure, ray_order
 from training.heat_map import HeatMap
-from training.paper import PaperPoint, read_paper
+from training.paper import PaperPoint, read_paper, shown_beside
 from training.report import ReportConfig, report
 from training.results import BASE, Results, Setting
 from training.tables import cost_table, spend_table
@@ -100,6 +100,18 @@ def test_the_papers_rows_stand_where_it_has_them_and_are_marked(results: Path, p
     assert not {row for row, _ in table} & {"*paper, 50 %*", "*paper, 3 %*", "*paper, 0 %*"}
     elsewhere = Setting("easy", "expert")
     assert "paper" not in cost_table(measurements, elsewhere, read_paper(paper))
+
+
+def test_the_papers_rows_can_stand_beside_traces_of_another_name(results: Path, paper: Path) -> None:
+    measurements, ours = Results.read(results).of(HARD), HARD._replace(dataset="nearsighted")
+    elsewhere = Setting("easy", "nearsighted")
+    theirs = read_paper(paper)
+    shown = shown_beside(theirs, "expert", [HARD, ours, elsewhere])
+    assert theirs.items() <= shown.items()
+    rows = [cells(cost_table(measurements, setting, shown)) for setting in (HARD, ours)]
+    assert rows[0] == rows[1]
+    assert "paper" not in cost_table(measurements, elsewhere, shown)
+    assert shown_beside(theirs, "", [ours]) == theirs
 
 
 def test_equal_spend_is_interpolated_and_dashed_outside(results: Path, paper: Path) -> None:
