@@ -10,7 +10,7 @@ made it (config.json, versions.json, metrics.jsonl) are copied beside it, with t
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +43,7 @@ class ExportConfig:
     run: tyro.conf.Positional[Path]  # folder written by training.train; with --int8 one of a bundle
     out: tyro.conf.Positional[Path]  # folder of the bundle; replaced if it exists
     name: str = ""  # of the bundle (empty: the run's)
+    target_cost: float | None = None  # C asked for where an engine says none; conditioned runs only (None: the run's)
     tolerance: float = 1e-4  # largest |Δ| between torch and ONNX that is accepted; int8 finds its own
     int8: bool = False  # large matrix products in int8
     episodes: int = 0  # with --int8: so many episodes of either bundle, for their returns
@@ -88,8 +89,13 @@ def golden_episode(trained: Trained, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def export(config: ExportConfig) -> Bundle:
-    """Write the bundle, verify it, put it in place; an existing bundle is replaced only by one that verified."""
+    """Write the bundle, verify it, put it in place; an existing bundle is replaced only by one that verified.
+
+    Raises ValueError for a target cost that the run cannot be asked for.
+    """
     trained = load_trained(config.run / "checkpoint.pt")
+    if config.target_cost is not None:
+        trained.model.config = _asking(trained.model.config, config.target_cost)
     with new_folder(config.out) as folder:
         write_graphs(trained, folder)
         np.savez_compressed(folder / "golden.npz", **golden_episode(trained))
@@ -101,6 +107,15 @@ def export(config: ExportConfig) -> Bundle:
             trained.facts.feature_map.write(folder / FEATURE_MAP)
         plot_curves(folder / "metrics.jsonl", folder / "curves.png", trained.config)
     return bundle
+
+
+def _asking(sizes: ModelConfig, target_cost: float) -> ModelConfig:
+    if sizes.cost_range is None:
+        raise ValueError(f"target_cost is {target_cost}, expected none: the run is not conditioned on a budget")
+    low, high = sizes.cost_range
+    if not low <= target_cost <= high:
+        raise ValueError(f"target_cost is {target_cost}, expected within what was trained, {low} to {high}")
+    return replace(sizes, target_cost=target_cost)
 
 
 def _manifest(trained: Trained, folder: Path, asked: ExportConfig) -> Manifest:

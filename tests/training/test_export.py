@@ -120,6 +120,22 @@ def test_every_method_exports_to_a_bundle_that_verifies(
     assert manifest.provenance["trained_budget"] == "conditioned"
 
 
+def test_a_bundle_can_ask_for_another_cost_than_its_run(dataset: Path, tmp_path: Path) -> None:
+    settings = {"budgets": (0.05, 0.3, 1.0), "budget": 0.25, "updates": 2, "log_every": 1}
+    train(toy.config(dataset, tmp_path / "run", **settings))
+    bundle = export(ExportConfig(tmp_path / "run", tmp_path / "bundle", target_cost=0.1))
+    assert bundle.manifest.target_cost == 0.1
+    for target_cost in (0.04, float("nan")):
+        with pytest.raises(ValueError, match=r"within what was trained, 0\.05 to 1\.0"):
+            export(ExportConfig(tmp_path / "run", tmp_path / "bundle", target_cost=target_cost))
+    assert Bundle.load(tmp_path / "bundle").manifest.target_cost == 0.1
+
+
+def test_a_cost_is_not_asked_of_a_run_that_does_not_read_it(trained: tuple[Path, TrainState], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not conditioned"):
+        export(ExportConfig(trained[0], tmp_path / "toy", target_cost=0.1))
+
+
 def test_a_served_bot_follows_the_budget_that_the_engine_gives_in_each_frame(dataset: Path, tmp_path: Path) -> None:
     """Random acquisition asks for each feature with probability C: what the graph was told can be read off."""
     settings = {"acquisition": "random", "budgets": (0.05, 1.0), "frame_budget": 1.0, "updates": 2, "log_every": 1}
