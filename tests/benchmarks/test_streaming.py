@@ -20,6 +20,7 @@ def test_memory_stays_bounded_whatever_the_size() -> None:
     command = [sys.executable, "-m", "benchmarks.streaming", *arguments, "--json"]
     printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     measured = json.loads(printed.strip().splitlines()[-1])
-    assert measured["streamed_mb"] < 40
+    assert measured["streamed_mb"] < 60  # 29 to 41 with what the allocator keeps; everything would be 96
+    assert measured["streamed_mb"] < measured["in_memory_mb"]
     assert measured["in_memory_mb"] > 50  # less than all: the kernel takes back pages of which nothing was read lately
     assert measured["streamed_per_s"] > 0 < measured["in_memory_per_s"]
