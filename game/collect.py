@@ -52,6 +52,10 @@ class Collect:
     kick_chance: float = 0.07  # per decision; a kick disturbs what is executed, not what is recorded
     sight_m: float | None = None  # how far the player recognises bridges and pools (None: as its skill says)
 
+    def __post_init__(self) -> None:
+        if self.sight_m is not None and not self.sight_m > 0.0:
+            raise ValueError(f"sight_m is {self.sight_m}, expected above 0 m")
+
     @property
     def skill(self) -> Skill:
         """How well the player sees and moves."""

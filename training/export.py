@@ -50,6 +50,10 @@ class ExportConfig:
     environment: str = ""  # of these episodes (empty: the one that the bundle names)
     seed: int = 1_000_000  # of the first of them
 
+    def __post_init__(self) -> None:
+        if self.int8 and self.target_cost is not None:
+            raise ValueError(f"target_cost is {self.target_cost}, expected none with int8 (its source says it)")
+
 
 def write_graphs(trained: Trained, folder: Path) -> None:
     """acquisition.onnx and action.onnx, for any number of bots N."""

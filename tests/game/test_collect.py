@@ -56,9 +56,13 @@ def test_a_player_sees_as_far_as_it_is_told():
     told = Collect(player="expert", sight_m=NEARSIGHTED.sight_m)
     assert told.skill == replace(EXPERT, sight_m=NEARSIGHTED.sight_m)
     env = NavigationEnv("hard")
-    near, far = (_recorded_actions(env, Collect(sight_m=sight_m)) for sight_m in (None, 2.0))
+    far, near, again = (_recorded_actions(env, Collect(sight_m=sight_m)) for sight_m in (None, 2.0, 2.0))
     env.close()
-    assert near.shape != far.shape or not np.array_equal(near, far)
+    assert not np.array_equal(near, far)
+    np.testing.assert_array_equal(near, again)
+    for sight_m in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="sight_m"):
+            Collect(sight_m=sight_m)
 
 
 def test_a_recorded_episode_starts_as_its_seed_does(recorded, easy):

@@ -134,6 +134,8 @@ def test_a_bundle_can_ask_for_another_cost_than_its_run(dataset: Path, tmp_path:
 def test_a_cost_is_not_asked_of_a_run_that_does_not_read_it(trained: tuple[Path, TrainState], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not conditioned"):
         export(ExportConfig(trained[0], tmp_path / "toy", target_cost=0.1))
+    with pytest.raises(ValueError, match="expected none with int8"):
+        ExportConfig(tmp_path / "toy", tmp_path / "toy-int8", int8=True, target_cost=0.1)
 
 
 def test_a_served_bot_follows_the_budget_that_the_engine_gives_in_each_frame(dataset: Path, tmp_path: Path) -> None:

@@ -20,8 +20,16 @@ SEEDS = list(range(11))
 @pytest.fixture(scope="module")
 def terms(tmp_path_factory: pytest.TempPathFactory) -> Terms:
     bundle = make_bundle(tmp_path_factory.mktemp("bundles") / "tiny")
-    caps = {"budget": 1.0, "frame_budget": None}
-    return Terms(bundle, LINE, bots=3, **caps, target_cost=None, target_return=None, with_heat_map=True)
+    return Terms(
+        bundle,
+        LINE,
+        bots=3,
+        budget=1.0,
+        frame_budget=None,
+        target_cost=None,
+        target_return=None,
+        with_heat_map=True,
+    )
 
 
 def frames_of(diary: list[int]) -> list[list[int]]:
