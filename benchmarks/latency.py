@@ -3,7 +3,8 @@
 A turn is one RequestQueries and one SubmitFeatures for all N bots: two round trips where there is a wire, without what
 the engine does between them. *Model* is the time in the two ONNX graphs (the replies' `infer_us`); what is left is
 allocation, bookkeeping, codec and transport. Rounds visit every transport in turn, so that the ratios hold when the
-machine's speed drifts. The server is its own process; with two cores or more it has one to itself.
+machine's speed drifts. The server is its own process; with two cores or more it has one to itself. The client is the
+one in Python and, for `uds C` and `tcp C`, the one in C (clients/c), which is left out where there is no C compiler.
 
     python -m benchmarks.latency --json
 """
@@ -16,6 +17,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import tyro
@@ -25,6 +27,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.cores import set_apart
+from benchmarks.engine import Engines, can_build
 from benchmarks.recorded import Timed, in_process, over
 from bot_runtime.bundle import Bundle
 from bot_runtime.golden import read_golden
@@ -34,6 +37,7 @@ from protocol.client import BotClient
 __all__ = ["Latency", "main", "measure"]
 
 _DOORS = {"uds": "unix", "tcp": "tcp", "ws": "ws", "http": "http"}
+_C_DOORS = {"uds C": "unix", "tcp C": "tcp"}
 _WARM_UP = 20
 _ROUND = 50  # turns of one transport before the next has its turn
 _QUANTILES = {"p50_us": 50.0, "p99_us": 99.0, "p999_us": 99.9}
@@ -55,9 +59,12 @@ def measure(config: Latency, console: Console) -> dict[str, dict[int, NDArray[np
     """Whole turn and model time in µs, [turns, 2], by transport and number of bots."""
     bundle = Bundle.load(config.bundle)
     golden = read_golden((config.bundle / "golden.npz").read_bytes(), bundle.manifest)
-    times: dict[str, dict[int, NDArray[np.float64]]] = {name: {} for name in ("inproc", *_DOORS)}
     with ExitStack() as stack:
-        most = str(max(config.bots) * len(_DOORS))
+        engines = Engines(Path(stack.enter_context(TemporaryDirectory()))) if can_build() else None
+        c_doors = {} if engines is None else _C_DOORS
+        names = ("inproc", *_DOORS, *c_doors)
+        times: dict[str, dict[int, NDArray[np.float64]]] = {name: {} for name in names}
+        most = str(max(config.bots) * (len(_DOORS) + len(c_doors)))
         served = ("--tcp-port", "0", "--max-bots", most, "--spin-us", str(config.spin_us))
         server = stack.enter_context(ServerProcess(config.bundle, *served))
         addresses = server.addresses()
@@ -71,6 +78,8 @@ def measure(config: Latency, console: Console) -> dict[str, dict[int, NDArray[np
                 for name, door in _DOORS.items():
                     client = clients.enter_context(BotClient(addresses[door], spin_us=config.spin_us))
                     play[name] = over(client, bundle, golden, n_bots)
+                for name, door in c_doors.items():
+                    play[name] = engines.over(addresses[door], golden, n_bots, config.spin_us, clients)
                 for name, rows in _rounds(play, config.turns, lambda done: progress.advance(task, done)).items():
                     times[name][n_bots] = np.array(rows)
     return times

@@ -2,7 +2,8 @@
 
     python -m benchmarks.observing [--json]
 
-Counting is `Recorder.answered` as `server.answer` calls it, with the five looks at the clock that it takes. A scrape is
+Counting is `Recorder.answered` as `server.answer` calls it and what it leaves to `settle`, which a server does when the
+reply has left, with the five looks at the clock that it takes. A scrape is
 the text of every transport and message in use, the most that a server writes; between its pieces the event loop does
 other work, so what counts is the longest of them. prometheus_client's own writer stands beside it. All of it is
 processor time of the one thread, so that other processes' share of the machine does not count; the best of `rounds`.
@@ -55,6 +56,7 @@ def measure(options: Options) -> dict[str, float]:
             begun_ns = clock()
             clock(), clock(), clock(), clock()
             recorder.answered("tcp", _QUERY, _QUERIES, Spans(begun_ns, begun_ns, begun_ns, begun_ns))
+            recorder.settle()
 
     text = "".join(pieces(families.requests(recorder)))
     registry = CollectorRegistry()

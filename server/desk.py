@@ -59,7 +59,7 @@ class Desk:
         worker_clock: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         self.handlers = handlers
-        self.looks = Looks(clock) if looks is None else looks
+        self.looks = Looks(clock, handlers.recorder.settle) if looks is None else looks
         self.due = Due(self.looks, default_us=default_deadline_us, clock=clock)
         self._worker = worker
         self._inline_us = inline_us

@@ -18,10 +18,16 @@ _AWAKE_NS = 500_000  # from the end of a look to the next, where the event loop 
 
 
 class Looks:
-    """The event loop's thread alone may use it. `clock` counts ns and is monotonic."""
+    """The event loop's thread alone may use it. `clock` counts ns and is monotonic.
 
-    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+    `afterwards` is called when all that a look found has been answered, or put to the worker, and nothing waits.
+    """
+
+    def __init__(
+        self, clock: Callable[[], int] = time.monotonic_ns, afterwards: Callable[[], object] = lambda: None
+    ) -> None:
         self._clock = clock
+        self._afterwards = afterwards
         self._waiting: deque[tuple[Callable[[], None], float]] = deque()
         self.backlog_us = 0.0  # what the jobs that wait will take, by what was expected of them
         self._is_taken = self._is_ending = False
@@ -76,4 +82,6 @@ class Looks:
             job()
         if self._waiting:
             self._expect_end()
+        else:
+            self._afterwards()
         self._ended_ns = self._clock()

@@ -1,7 +1,7 @@
 """What every answered request leaves behind: counts in buckets that fit microseconds, cheap enough for every request.
 
-This module knows nothing about Prometheus, sockets or bots. Whoever answers counts: one request at a time, be it on
-the worker's thread or on the event loop. Refusals may come from both, so they alone take a lock. Whoever reads sees
+This module knows nothing about Prometheus, sockets or bots. Whoever answers only notes that it has: counting takes
+longer, and is done once the reply has left (`settle`), or by whoever reads. Both may be on any thread. What is read are
 plain integers that only grow, each right by itself, and at most one request apart from each other.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_left
+from collections import deque
 
 from msgspec import Struct
 
@@ -23,6 +24,7 @@ NS_BOUNDS = tuple(round(bound_us * 1e3) for bound_us in (*_BOUNDS_US, *_LONG_BOU
 BATCH_BOUNDS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 PHASES = ("wait", "decode", "inference", "encode")
 WHOLE = len(PHASES)  # the histogram after those of the phases
+_MOST_NOTED = 64  # answers that wait to be counted: a server that is never idle counts them in between
 _TURNS, _TURN_REPLIES = (RequestQueries, SubmitFeatures, TakeTurn), (Queries, Actions)
 
 
@@ -79,22 +81,40 @@ class Recorder:
     """What was answered, by transport and type of request, and what was refused, by transport and code."""
 
     def __init__(self) -> None:
-        self.answers: dict[tuple[str, type[Request]], Histograms] = {}
         self.refusals: dict[tuple[str, str], int] = {}
-        self._refusing = threading.Lock()
+        self._answers: dict[tuple[str, type[Request]], Histograms] = {}
+        self._noted: deque[tuple[str, Request, Reply, Spans]] = deque()
+        self._counting = threading.Lock()
+
+    @property
+    def answers(self) -> dict[tuple[str, type[Request]], Histograms]:
+        """All that were noted before, counted."""
+        self.settle()
+        return self._answers
 
     def answered(self, transport: str, request: Request, reply: Reply, spans: Spans) -> None:
-        """Count one request that was answered as it asked for. Not thread-safe: one request is answered at a time."""
+        """Note one request that was answered as it asked for."""
+        self._noted.append((transport, request, reply, spans))
+        if len(self._noted) >= _MOST_NOTED:
+            self.settle()
+
+    def settle(self) -> None:
+        """Count what was noted."""
+        with self._counting:
+            while self._noted:
+                self._count(*self._noted.popleft())
+
+    def _count(self, transport: str, request: Request, reply: Reply, spans: Spans) -> None:
         key = transport, type(request)
-        histograms = self.answers.get(key)
+        histograms = self._answers.get(key)
         if histograms is None:
-            histograms = self.answers[key] = Histograms()
+            histograms = self._answers[key] = Histograms()
         if isinstance(reply, _TURN_REPLIES) and isinstance(request, _TURNS):
             histograms.count_half_turn(spans, reply.infer_us, len(request.bots))
         else:
             histograms.count(spans.whole_ns)
 
     def refused(self, transport: str, code: str) -> None:
-        """Count one request that was refused with this code; from any thread."""
-        with self._refusing:
+        """Count one request that was refused with this code."""
+        with self._counting:
             self.refusals[transport, code] = self.refusals.get((transport, code), 0) + 1

@@ -74,6 +74,7 @@ class TrainConfig:
     gradient_clip: float = 1.0
 
     device: str = "cpu"  # as torch names it
+    matmul_precision: Literal["highest", "high", "medium"] = "highest"  # of float32 products, as torch names it
     log_every: int = 50  # updates between lines of metrics
     checkpoint_every: int = 500  # updates between checkpoints
 

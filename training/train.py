@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import argparse
 import math
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -174,6 +175,11 @@ def held_out_loss(forward: Pass, drawn: Drawn) -> float:
 
 def train(config: TrainConfig) -> TrainState:
     """Train to the end, from the run's checkpoint if there is one; returns the final state."""
+    with _matmul_precision(config.matmul_precision):
+        return _train(config)
+
+
+def _train(config: TrainConfig) -> TrainState:
     traces = open_traces(config)
     state = new_state(config, traces)
     if (config.out / "checkpoint.pt").exists():
@@ -190,6 +196,17 @@ def train(config: TrainConfig) -> TrainState:
             if run is not None:
                 run.record()
     return state
+
+
+@contextmanager
+def _matmul_precision(precision: str) -> Iterator[None]:
+    """Below `highest`, torch may round what it multiplies, not what it adds: TF32 on a GPU, bfloat16 on a CPU."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def _weigh(run: Path, traces: TraceSource) -> Traces:

@@ -31,7 +31,8 @@ bots_status bots_connect(const char *url, const bots_options *options, bots_clie
     *client = NULL;
     options = options == NULL ? &defaults : options;
     timeout_ms = options->timeout_ms == 0 ? DEFAULT_TIMEOUT_MS : options->timeout_ms;
-    if (url == NULL || timeout_ms < 1 || timeout_ms > BOTS_MAX_TIMEOUT_MS || botsp_parse(url, &address) != BOTS_OK)
+    if (url == NULL || timeout_ms < 1 || timeout_ms > BOTS_MAX_TIMEOUT_MS || options->spin_us < 0
+        || options->spin_us > BOTS_MAX_SPIN_US || botsp_parse(url, &address) != BOTS_OK)
         return BOTS_BAD_ARGUMENT;
     if (options->resize != NULL) {
         memory.resize = options->resize;
@@ -45,6 +46,7 @@ bots_status bots_connect(const char *url, const bots_options *options, bots_clie
     made->clock_ns = options->clock_ns == NULL ? botsp_now_ns : options->clock_ns;
     made->clock_context = options->clock_context;
     made->timeout_ns = (uint64_t)timeout_ms * 1000000u;
+    made->spin_ns = (uint64_t)options->spin_us * 1000u;
     made->address = address;
     made->fd = -1;
     status = dial(made);

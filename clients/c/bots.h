@@ -22,6 +22,7 @@ extern "C" {
 #define BOTS_MAX_FRAME ((int64_t)1 << 53)
 #define BOTS_MAX_REPLY_BYTES ((size_t)64 << 20)
 #define BOTS_MAX_TIMEOUT_MS 3600000
+#define BOTS_MAX_SPIN_US 10000
 
 typedef enum bots_status {
     BOTS_OK = 0,
@@ -78,6 +79,9 @@ typedef struct bots_options {
     /* As realloc; with 0 bytes as free, returning NULL. NULL: the C library's. */
     void *(*resize)(void *context, void *memory, size_t bytes);
     void *resize_context;
+    /* How long to poll for an answer before the thread sleeps until it comes, 0 to BOTS_MAX_SPIN_US: for a thread that
+     * has a core. 0: sleep at once. */
+    int spin_us;
 } bots_options;
 
 typedef struct bots_feature {

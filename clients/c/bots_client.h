@@ -11,7 +11,7 @@ struct bots_client {
     botsp_memory memory;
     uint64_t (*clock_ns)(void *context);
     void *clock_context;
-    uint64_t timeout_ns;
+    uint64_t timeout_ns, spin_ns;
     botsp_address address;
     int fd; /* -1: closed */
     int is_welcome; /* between hello and whatever ended the connection */

@@ -198,7 +198,7 @@ bots_status botsp_exchange(bots_client *client, botsp_writer *writer, const char
         bytes[i] = (uint8_t)((uint64_t)body >> (24 - 8 * i));
     status = botsp_send(client->fd, bytes, size, until_ns);
     if (status == BOTS_OK)
-        status = botsp_receive(client->fd, &client->memory, &client->reply, &size, until_ns);
+        status = botsp_receive(client->fd, &client->memory, &client->reply, &size, until_ns, client->spin_ns);
     if (status != BOTS_OK)
         return botsp_break(client, status, why(status));
     body = size - PREFIX_BYTES;

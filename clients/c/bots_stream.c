@@ -8,6 +8,7 @@
 
 #include <errno.h>
 #include <poll.h>
+#include <sched.h>
 #include <string.h>
 #include <sys/socket.h>
 #include <time.h>
@@ -85,9 +86,22 @@ static uint64_t frame_size(const uint8_t *bytes, size_t size)
     return PREFIX_BYTES + ((uint64_t)bytes[0] << 24 | (uint64_t)bytes[1] << 16 | (uint64_t)bytes[2] << 8 | bytes[3]);
 }
 
-bots_status botsp_receive(int fd, const botsp_memory *memory, botsp_buffer *buffer, size_t *size, uint64_t until_ns)
+/* Until there may be something to read. A thread that stays awake offers its core to the server, which may have no
+ * other, and looks again. */
+static bots_status wait_to_read(int fd, uint64_t awake_until_ns, uint64_t until_ns)
 {
-    uint64_t whole;
+    if (botsp_now_ns(NULL) >= awake_until_ns)
+        return botsp_wait(fd, POLLIN, until_ns);
+    sched_yield();
+    return BOTS_OK;
+}
+
+bots_status botsp_receive(int fd, const botsp_memory *memory, botsp_buffer *buffer, size_t *size, uint64_t until_ns,
+                          uint64_t spin_ns)
+{
+    uint64_t whole, awake_until_ns = botsp_now_ns(NULL) + spin_ns;
+    if (awake_until_ns > until_ns)
+        awake_until_ns = until_ns;
     *size = 0;
     while ((whole = frame_size(buffer->bytes, *size)) == 0 || *size < whole) {
         bots_status status;
@@ -96,7 +110,7 @@ bots_status botsp_receive(int fd, const botsp_memory *memory, botsp_buffer *buff
             return BOTS_BAD_REPLY;
         if (!botsp_grow(memory, buffer, *size < FIRST_BYTES ? FIRST_BYTES : *size + 1))
             return BOTS_NO_MEMORY;
-        status = botsp_wait(fd, POLLIN, until_ns);
+        status = wait_to_read(fd, awake_until_ns, until_ns);
         if (status != BOTS_OK)
             return status;
         n = recv(fd, (uint8_t *)buffer->bytes + *size, buffer->capacity - *size, 0);

@@ -24,8 +24,9 @@ bots_status botsp_wait(int fd, short events, uint64_t until_ns);
 bots_status botsp_dial(const botsp_address *address, uint64_t until_ns, int *fd);
 bots_status botsp_send(int fd, const uint8_t *bytes, size_t size, uint64_t until_ns);
 /* One frame into `buffer`, its length first, `size` bytes in all; BOTS_BAD_REPLY and BOTS_NO_MEMORY too. Memory grows
- * with what has come, not with what is announced. */
-bots_status botsp_receive(int fd, const botsp_memory *memory, botsp_buffer *buffer, size_t *size, uint64_t until_ns);
+ * with what has come, not with what is announced. For the first `spin_ns` the thread does not sleep. */
+bots_status botsp_receive(int fd, const botsp_memory *memory, botsp_buffer *buffer, size_t *size, uint64_t until_ns,
+                          uint64_t spin_ns);
 void botsp_hang_up(int *fd);
 
 #endif

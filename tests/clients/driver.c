@@ -85,6 +85,7 @@ static void connect_to(void **in)
     options.clock_ns = clock_step_ns == 0 ? NULL : clock_ns;
     options.resize = resize;
     n_allowed = (long)*(int64_t *)in[3];
+    options.spin_us = (int)*(int64_t *)in[4];
     n_allocations = 0;
     bots_close(client);
     is_ok(bots_connect(in[0], &options, &client));

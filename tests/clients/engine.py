@@ -50,12 +50,20 @@ class CClient:
     """The calls of bots.h, each a line to the driver and a line back. Leaving it fails if the driver did."""
 
     def __init__(
-        self, folder: Path, url: str, *, timeout_ms: int = 5000, clock_step_ns: int = 0, n_allowed: int = 2**30
+        self,
+        folder: Path,
+        url: str,
+        *,
+        timeout_ms: int = 5000,
+        clock_step_ns: int = 0,
+        n_allowed: int = 2**30,
+        spin_us: int = 0,
     ) -> None:
         self._process = subprocess.Popen(
             [folder / "driver"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
-        self._how = url.encode() + b"\0", _int(timeout_ms), _int(clock_step_ns), _int(n_allowed)
+        how = timeout_ms, clock_step_ns, n_allowed, spin_us
+        self._how = url.encode() + b"\0", *(_int(each) for each in how)
 
     def __enter__(self) -> Self:
         try:

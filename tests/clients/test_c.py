@@ -36,11 +36,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield running
 
 
-@pytest.fixture(params=["tcp", "unix"])
+@pytest.fixture(params=[("tcp", 0), ("unix", 0), ("tcp", 5000), ("unix", 1)])
 def pair(request: pytest.FixtureRequest, served: Served, built: Path) -> Iterator[tuple[CClient, BotClient]]:
-    """Both clients, each with a connection of its own, by the same door."""
-    url = served.addresses[request.param]
-    with CClient(built, url) as ours, BotClient(url) as theirs:
+    """Both clients, each with a connection of its own, by the same door; ours polls for so many µs before it sleeps."""
+    door, spin_us = request.param
+    url = served.addresses[door]
+    with CClient(built, url, spin_us=spin_us) as ours, BotClient(url) as theirs:
         ours.hello(TOKEN)
         theirs.hello(token=TOKEN)
         yield ours, theirs

@@ -150,8 +150,12 @@ def test_arguments_that_cannot_be_sent_are_not(built: Path) -> None:
 def test_nobody_there_and_nobody_answering(built: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         url = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
-        with CClient(built, url, timeout_ms=50) as client, pytest.raises(Refused, match="TIMEOUT"):
-            client.hello()
+        for spin_us in (0, 10_000):  # polling or asleep
+            with CClient(built, url, timeout_ms=8, spin_us=spin_us) as client, pytest.raises(Refused, match="TIMEOUT"):
+                client.hello()
+        for spin_us in (-1, 10_001):
+            with pytest.raises(Refused, match="BAD_ARGUMENT"), CClient(built, url, spin_us=spin_us):
+                pass
     for nobody in (url, f"unix://{tmp_path}/none"):
         with pytest.raises(Refused, match="SYSTEM"), CClient(built, nobody):
             pass
