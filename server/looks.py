@@ -20,7 +20,7 @@ _AWAKE_NS = 500_000  # from the end of a look to the next, where the event loop 
 class Looks:
     """The event loop's thread alone may use it. `clock` counts ns and is monotonic.
 
-    `afterwards` is called when all that a look found has been answered, or put to the worker, and nothing waits.
+    `afterwards` is called at the end of a look, when its answers have left, unless others wait.
     """
 
     def __init__(
@@ -76,12 +76,12 @@ class Looks:
         self._is_ending = self._is_taken = False
         self._last_ns = self._ended_ns if self._first_ns is None else self._first_ns
         self._first_ns = None
+        if not self._waiting:
+            self._afterwards()
         while self._waiting and not self._is_taken:
             job, expected_us = self._waiting.popleft()
             self.backlog_us = self.backlog_us - expected_us if self._waiting else 0.0
             job()
         if self._waiting:
             self._expect_end()
-        else:
-            self._afterwards()
         self._ended_ns = self._clock()

@@ -68,6 +68,21 @@ def test_who_leaves_its_turn_leaves_it_to_the_next() -> None:
     run(test)
 
 
+def test_what_can_wait_is_done_when_nothing_else_waits() -> None:
+    async def main() -> None:
+        done: list[str] = []
+        looks = Looks(afterwards=lambda: done.append("afterwards"))
+        looks.take()
+        assert not done  # what was answered in this look has not left yet
+        for name in ("first", "second"):
+            looks.put(lambda name=name: (looks.take(), done.append(name)), 1.0)
+        for look in range(1, 4):
+            await asyncio.sleep(0)
+            assert done == ["first", "second", "afterwards"][:look]
+
+    asyncio.run(main())
+
+
 def test_after_sleep_what_is_read_has_just_come() -> None:
     async def test(looks: Looks, clock: Clock) -> None:
         first_ns = clock.ns

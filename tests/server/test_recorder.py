@@ -32,6 +32,18 @@ def test_every_phase_is_in_its_bucket(durations: list[tuple[int, int, int, int, 
     assert histograms.batches[2] == len(durations)  # 3 bots: above 2, at most 4
 
 
+def test_what_was_noted_is_counted_once_by_whoever_reads_and_never_waits_in_numbers() -> None:
+    recorder = Recorder()
+    reply = Queries(frame=1, queries=b"", cost_us=[], infer_us=1.0)
+    for answered in range(1, 201):
+        recorder.answered("tcp", REQUEST, reply, Spans(1, 2, 3, 6))
+        assert len(recorder._noted) < 64
+        if answered % 70 == 0:
+            recorder.settle()
+            assert not recorder._noted
+    assert [sum(recorder.answers["tcp", RequestQueries].counts[WHOLE]) for _ in range(2)] == [200, 200]
+
+
 def test_what_is_no_turn_has_no_phases() -> None:
     recorder = Recorder()
     recorder.answered("http", Goodbye(), Farewell(), Spans(1, 2, 3, 1500))
