@@ -20,7 +20,7 @@ _AWAKE_NS = 500_000  # from the end of a look to the next, where the event loop 
 class Looks:
     """The event loop's thread alone may use it. `clock` counts ns and is monotonic.
 
-    `afterwards` is called at the end of a look, when its answers have left, unless others wait.
+    `afterwards` is called at the end of a look, when what was answered on streams has left, unless others wait.
     """
 
     def __init__(
