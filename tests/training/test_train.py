@@ -152,6 +152,28 @@ def train_interrupted(config: TrainConfig, after: int) -> None:
             room.train(config)
 
 
+def test_products_are_as_precise_as_the_run_says_until_it_ends(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import training.train as room
+
+    original, seen = room.update, []
+
+    def seeing(*arguments: object) -> None:
+        seen.append(torch.get_float32_matmul_precision())
+        if len(seen) == 4:
+            raise KeyboardInterrupt
+        original(*arguments)
+
+    monkeypatch.setattr(room, "update", seeing)
+    config = toy.config(dataset, tmp_path, updates=3)
+    train(config)
+    with pytest.raises(KeyboardInterrupt):
+        train(dataclasses.replace(config, out=tmp_path / "medium", matmul_precision="medium"))
+    assert seen == ["highest"] * 3 + ["medium"]
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
 def test_writes_what_is_needed_to_repeat_the_run(trained: tuple[Path, TrainState]) -> None:
     out, state = trained
     config = TrainConfig.read(out / "config.json")
