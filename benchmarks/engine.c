@@ -11,11 +11,17 @@
 
 #include "bots.h"
 
+/* Recorded frames, [T, F] and [T, D]. */
+typedef struct engine_rows {
+    const float *free_rows, *costly_rows;
+    size_t n_rows, n_free, n_costly; /* T, F, D */
+} engine_rows;
+
 typedef struct engine {
     bots_client *client;
     const bots_welcome *welcome;
-    const float *free_rows, *costly_rows; /* [T, F], [T, D] */
-    size_t n_rows, n_bots;
+    engine_rows recorded;
+    size_t n_bots;
     int64_t *bots;
     float *free_numbers, *costly; /* [N, F], [N, D] */
     int64_t frame;
@@ -32,7 +38,7 @@ static void look(const engine *played, const float *rows, size_t n_numbers, floa
 {
     size_t bot;
     for (bot = 0; bot < played->n_bots; bot++) {
-        size_t row = ((size_t)played->frame + bot) % played->n_rows;
+        size_t row = ((size_t)played->frame + bot) % played->recorded.n_rows;
         memcpy(out + bot * n_numbers, rows + row * n_numbers, n_numbers * sizeof *out);
     }
 }
@@ -48,9 +54,9 @@ void engine_close(engine *played)
     free(played);
 }
 
-/* NULL: no server there, or it refused. The rows are read until the engine is closed. */
-engine *engine_open(const char *url, int spin_us, size_t n_bots, const float *free_rows, const float *costly_rows,
-                    size_t n_rows)
+/* NULL: no server there, it refused, or its features are others than were recorded. The rows are read until the engine
+ * is closed. */
+engine *engine_open(const char *url, int spin_us, size_t n_bots, engine_rows recorded)
 {
     bots_options options;
     bots_start_fields start;
@@ -58,17 +64,16 @@ engine *engine_open(const char *url, int spin_us, size_t n_bots, const float *fr
     memset(&options, 0, sizeof options);
     memset(&start, 0, sizeof start);
     options.spin_us = spin_us;
-    start.count = played == NULL ? 0 : n_bots;
+    start.count = n_bots;
     if (played == NULL || bots_connect(url, &options, &played->client) != BOTS_OK
-        || bots_hello(played->client, NULL, &played->welcome) != BOTS_OK)
+        || bots_hello(played->client, NULL, &played->welcome) != BOTS_OK
+        || played->welcome->n_free != recorded.n_free || played->welcome->n_costly != recorded.n_costly)
         goto failed;
+    played->recorded = recorded;
     played->n_bots = n_bots;
     played->bots = malloc(n_bots * sizeof *played->bots);
-    played->free_numbers = calloc(n_bots * played->welcome->n_free + 1, sizeof(float));
-    played->costly = calloc(n_bots * played->welcome->n_costly + 1, sizeof(float));
-    played->free_rows = free_rows;
-    played->costly_rows = costly_rows;
-    played->n_rows = n_rows;
+    played->free_numbers = calloc(n_bots * recorded.n_free + 1, sizeof(float));
+    played->costly = calloc(n_bots * recorded.n_costly + 1, sizeof(float));
     if (played->bots == NULL || played->free_numbers == NULL || played->costly == NULL
         || bots_start(played->client, &start, played->bots) != BOTS_OK)
         goto failed;
@@ -92,14 +97,14 @@ int engine_turn(engine *played, double *us)
     turn.bots = played->bots;
     turn.free = played->free_numbers;
     turn.costly = played->costly;
-    look(played, played->free_rows, played->welcome->n_free, played->free_numbers);
+    look(played, played->recorded.free_rows, played->recorded.n_free, played->free_numbers);
     begun_us = now_us();
     status = bots_query(played->client, &turn, &queries);
     us[0] = now_us() - begun_us;
     if (status != BOTS_OK)
         return (int)status;
     turn.acquired = queries.queries;
-    look(played, played->costly_rows, played->welcome->n_costly, played->costly);
+    look(played, played->recorded.costly_rows, played->recorded.n_costly, played->costly);
     begun_us = now_us();
     status = bots_act(played->client, &turn, &actions);
     us[0] += now_us() - begun_us;

@@ -1,6 +1,6 @@
 """An engine in C (`benchmarks/engine.c` on `clients/c`), built here and played from here, a turn a call.
 
-This module knows nothing about what is measured, or in which order. It needs a C compiler and `make`.
+This module knows nothing about what is measured, or in which order. It needs a C compiler.
 """
 
 from __future__ import annotations
@@ -28,15 +28,28 @@ def can_build() -> bool:
     return shutil.which("cc") is not None and _CLIENT.is_dir()
 
 
+class _Rows(ctypes.Structure):
+    """`engine_rows` of engine.c."""
+
+    _fields_ = (
+        ("free_rows", ctypes.c_void_p),
+        ("costly_rows", ctypes.c_void_p),
+        ("n_rows", ctypes.c_size_t),
+        ("n_free", ctypes.c_size_t),
+        ("n_costly", ctypes.c_size_t),
+    )
+
+
 class Engines:
     """Builds the engine into `folder`. Raises CalledProcessError."""
 
     def __init__(self, folder: Path) -> None:
         built = folder / "engine.so"
         sources = [_HERE / "engine.c", *sorted(_CLIENT.glob("bots*.c"))]
-        flags = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC")
-        subprocess.run(["cc", *flags, f"-I{_CLIENT}", *map(str, sources), "-lm", "-o", str(built)], check=True)
+        command = ["cc", "-std=c99", "-O2", "-shared", "-fPIC", f"-I{_CLIENT}", *map(str, sources), "-lm"]
+        subprocess.run([*command, "-o", str(built)], check=True)
         self._library = ctypes.CDLL(str(built))
+        self._library.engine_open.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_size_t, _Rows]
         self._library.engine_open.restype = ctypes.c_void_p
         self._library.engine_close.argtypes = [ctypes.c_void_p]
         self._library.engine_turn.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
@@ -46,20 +59,22 @@ class Engines:
 
         Raises ConnectionError.
         """
-        rows = [np.ascontiguousarray(golden[name], dtype=np.float32) for name in ("free", "costly")]
-        pointers = [ctypes.c_void_p(each.ctypes.data) for each in rows]
-        sizes = ctypes.c_size_t(n_bots), ctypes.c_size_t(len(rows[0]))
-        engine = self._library.engine_open(url.encode(), round(spin_us), sizes[0], *pointers, sizes[1])
+        free_TF, costly_TD = (np.ascontiguousarray(golden[name], dtype=np.float32) for name in ("free", "costly"))
+        rows = _Rows(free_TF.ctypes.data, costly_TD.ctypes.data, len(free_TF), free_TF.shape[1], costly_TD.shape[1])
+        engine = self._library.engine_open(url.encode(), round(spin_us), n_bots, rows)
         if engine is None:
-            raise ConnectionError(f"no server answers at {url}")
-        clients.callback(self._library.engine_close, engine)
+            raise ConnectionError(f"no server of such features answers at {url}")
+        clients.callback(self._close, engine, free_TF, costly_TD)
         us = np.zeros(2)
         play, told = self._library.engine_turn, us.ctypes.data
 
-        def turn(_: object = rows) -> Timed:
+        def turn() -> Timed:
             status = play(engine, told)
             if status:
                 raise ConnectionError(f"a turn at {url} failed with status {status} of bots.h")
             return float(us[0]), float(us[1])
 
         return turn
+
+    def _close(self, engine: int, *_read_until_now: object) -> None:
+        self._library.engine_close(engine)

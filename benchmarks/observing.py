@@ -3,10 +3,10 @@
     python -m benchmarks.observing [--json]
 
 Counting is `Recorder.answered` as `server.answer` calls it and what it leaves to `settle`, which a server does when the
-reply has left, with the five looks at the clock that it takes. A scrape is
-the text of every transport and message in use, the most that a server writes; between its pieces the event loop does
-other work, so what counts is the longest of them. prometheus_client's own writer stands beside it. All of it is
-processor time of the one thread, so that other processes' share of the machine does not count; the best of `rounds`.
+reply has left, with the five looks at the clock that it takes. A scrape is the text of every transport and message in
+use, the most that a server writes; between its pieces the event loop does other work, so what counts is the longest of
+them. prometheus_client's own writer stands beside it. All of it is processor time of the one thread, so that other
+processes' share of the machine does not count; the best of `rounds`.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ _AWAKE_NS = 500_000  # from the end of a look to the next, where the event loop 
 class Looks:
     """The event loop's thread alone may use it. `clock` counts ns and is monotonic.
 
-    `afterwards` is called at the end of a look, when what was answered on streams has left, unless others wait.
+    `afterwards` is called after a look in which nothing waited any more, once its answers on streams have left.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Looks:
         self._last_ns = self._ended_ns if self._first_ns is None else self._first_ns
         self._first_ns = None
         if not self._waiting:
-            self._afterwards()
+            asyncio.get_running_loop().call_soon(self._afterwards)  # behind the answers of those that waited
         while self._waiting and not self._is_taken:
             job, expected_us = self._waiting.popleft()
             self.backlog_us = self.backlog_us - expected_us if self._waiting else 0.0

@@ -2,7 +2,7 @@
 
 This module knows nothing about Prometheus, sockets or bots. Whoever answers only notes that it has: counting takes
 longer, and is done once the reply has left (`settle`), or by whoever reads. Both may be on any thread. What is read are
-plain integers that only grow, each right by itself, and at most one request apart from each other.
+plain integers that only grow, each right by itself, and apart from each other by what is counted meanwhile.
 """
 
 from __future__ import annotations
@@ -35,6 +35,14 @@ class Spans(Struct, frozen=True):
     decode_ns: int
     encode_ns: int
     whole_ns: int
+
+
+class _Noted(Struct, frozen=True):
+    transport: str
+    kind: type[Request]
+    spans: Spans
+    infer_us: float | None  # None: no turn, nor half of one
+    n_bots: int
 
 
 class Histograms:
@@ -83,38 +91,47 @@ class Recorder:
     def __init__(self) -> None:
         self.refusals: dict[tuple[str, str], int] = {}
         self._answers: dict[tuple[str, type[Request]], Histograms] = {}
-        self._noted: deque[tuple[str, Request, Reply, Spans]] = deque()
-        self._counting = threading.Lock()
+        self._noted: deque[_Noted] = deque()
+        self._counting, self._refusing = threading.Lock(), threading.Lock()
 
     @property
     def answers(self) -> dict[tuple[str, type[Request]], Histograms]:
         """All that were noted before, counted."""
-        self.settle()
+        with self._counting:
+            self._count_noted()
         return self._answers
 
     def answered(self, transport: str, request: Request, reply: Reply, spans: Spans) -> None:
         """Note one request that was answered as it asked for."""
-        self._noted.append((transport, request, reply, spans))
+        if isinstance(reply, _TURN_REPLIES) and isinstance(request, _TURNS):
+            noted = _Noted(transport, type(request), spans, reply.infer_us, len(request.bots))
+        else:
+            noted = _Noted(transport, type(request), spans, None, 0)
+        self._noted.append(noted)
         if len(self._noted) >= _MOST_NOTED:
             self.settle()
 
     def settle(self) -> None:
-        """Count what was noted."""
-        with self._counting:
-            while self._noted:
-                self._count(*self._noted.popleft())
+        """Count what was noted, unless another thread is counting, which is not waited for."""
+        if self._counting.acquire(blocking=False):
+            try:
+                self._count_noted()
+            finally:
+                self._counting.release()
 
-    def _count(self, transport: str, request: Request, reply: Reply, spans: Spans) -> None:
-        key = transport, type(request)
-        histograms = self._answers.get(key)
-        if histograms is None:
-            histograms = self._answers[key] = Histograms()
-        if isinstance(reply, _TURN_REPLIES) and isinstance(request, _TURNS):
-            histograms.count_half_turn(spans, reply.infer_us, len(request.bots))
-        else:
-            histograms.count(spans.whole_ns)
+    def _count_noted(self) -> None:
+        while self._noted:
+            noted = self._noted.popleft()
+            key = noted.transport, noted.kind
+            histograms = self._answers.get(key)
+            if histograms is None:
+                histograms = self._answers[key] = Histograms()
+            if noted.infer_us is None:
+                histograms.count(noted.spans.whole_ns)
+            else:
+                histograms.count_half_turn(noted.spans, noted.infer_us, noted.n_bots)
 
     def refused(self, transport: str, code: str) -> None:
         """Count one request that was refused with this code."""
-        with self._counting:
+        with self._refusing:
             self.refusals[transport, code] = self.refusals.get((transport, code), 0) + 1

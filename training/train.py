@@ -200,7 +200,7 @@ def _train(config: TrainConfig) -> TrainState:
 
 @contextmanager
 def _matmul_precision(precision: str) -> Iterator[None]:
-    """Below `highest`, torch may round what it multiplies, not what it adds: TF32 on a GPU, bfloat16 on a CPU."""
+    """Below `highest`, torch may round what it multiplies, not what it adds: to TF32, or where `medium` to bfloat16."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(precision)
     try:

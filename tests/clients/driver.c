@@ -4,9 +4,11 @@
  * sanitizer sees the client read beyond it. A line of output is a status and then arrays as hex, or the error. */
 #define _POSIX_C_SOURCE 200809L
 #include <inttypes.h>
+#include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 
 #include "bots.h"
 
@@ -16,6 +18,34 @@ static bots_client *client;
 static const bots_welcome *welcome;
 static uint64_t clock_step_ns, ticks_ns;
 static long n_allocations, n_allowed;
+static uint64_t look_step_ns, looked_ns; /* how much faster than the system's the client's own clock goes, a look */
+static long n_yields, n_polls;
+
+/* What the linker puts in the place of the library's calls. */
+int __real_sched_yield(void);
+int __real_poll(struct pollfd *polled, nfds_t n, int timeout_ms);
+int __real_clock_gettime(clockid_t clock, struct timespec *now);
+
+int __wrap_sched_yield(void)
+{
+    n_yields++;
+    return __real_sched_yield();
+}
+
+int __wrap_poll(struct pollfd *polled, nfds_t n, int timeout_ms)
+{
+    n_polls++;
+    return __real_poll(polled, n, timeout_ms);
+}
+
+int __wrap_clock_gettime(clockid_t clock, struct timespec *now)
+{
+    int rc = __real_clock_gettime(clock, now);
+    uint64_t ns = (uint64_t)now->tv_nsec + (looked_ns += look_step_ns);
+    now->tv_sec += (time_t)(ns / 1000000000u);
+    now->tv_nsec = (long)(ns % 1000000000u);
+    return rc;
+}
 
 static uint64_t clock_ns(void *context)
 {
@@ -87,8 +117,11 @@ static void connect_to(void **in)
     n_allowed = (long)*(int64_t *)in[3];
     options.spin_us = (int)*(int64_t *)in[4];
     n_allocations = 0;
+    look_step_ns = 0;
     bots_close(client);
     is_ok(bots_connect(in[0], &options, &client));
+    look_step_ns = *(uint64_t *)in[5];
+    n_yields = n_polls = 0;
 }
 
 static void hello(void **in, const size_t *sizes)
@@ -190,7 +223,7 @@ static void obey(const char *name, void **in, const size_t *sizes)
     else if (strcmp(name, "goodbye") == 0)
         is_ok(bots_goodbye(client));
     else if (strcmp(name, "counts") == 0)
-        printf("OK %" PRIu64 " %ld", bots_n_late(client), n_allocations);
+        printf("OK %" PRIu64 " %ld %ld %ld", bots_n_late(client), n_allocations, n_yields, n_polls);
     else
         turn(name, in, sizes);
 }

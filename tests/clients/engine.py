@@ -10,10 +10,11 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["ROOT", "CClient", "Refused", "Turn", "build"]
+__all__ = ["ROOT", "CClient", "Counts", "Refused", "Turn", "build"]
 
 ROOT = Path(__file__).resolve().parents[2]
 SANITIZED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+_WRAPPED = tuple(f"-Wl,--wrap={name}" for name in ("sched_yield", "poll", "clock_gettime"))  # what driver.c counts
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
@@ -24,7 +25,9 @@ def build(folder: Path) -> Path:
     subprocess.run(made, check=True)
     for name in ("driver", "mutants"):
         files = [str(ROOT / "tests" / "clients" / f"{name}.c"), str(folder / "libbots.a")]
-        subprocess.run(["cc", *STRICT, *SANITIZED, f"-I{source}", *files, "-o", str(folder / name)], check=True)
+        wrapped = _WRAPPED if name == "driver" else ()
+        command = ["cc", *STRICT, *SANITIZED, *wrapped, f"-I{source}", *files, "-o", str(folder / name)]
+        subprocess.run(command, check=True)
     return folder
 
 
@@ -46,6 +49,16 @@ class Turn(NamedTuple):
     late: bool
 
 
+class Counts(NamedTuple):
+    """How many answers came late, how often memory was asked for and, since it was connected, how often the client
+    offered its core while it polled, and how often it went to sleep until there is something to read."""
+
+    late: int
+    allocations: int
+    yields: int
+    sleeps: int
+
+
 class CClient:
     """The calls of bots.h, each a line to the driver and a line back. Leaving it fails if the driver did."""
 
@@ -58,11 +71,12 @@ class CClient:
         clock_step_ns: int = 0,
         n_allowed: int = 2**30,
         spin_us: int = 0,
+        look_step_ns: int = 0,
     ) -> None:
         self._process = subprocess.Popen(
             [folder / "driver"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
-        how = timeout_ms, clock_step_ns, n_allowed, spin_us
+        how = timeout_ms, clock_step_ns, n_allowed, spin_us, look_step_ns
         self._how = url.encode() + b"\0", *(_int(each) for each in how)
 
     def __enter__(self) -> Self:
@@ -151,10 +165,9 @@ class CClient:
     def goodbye(self) -> None:
         self.call("goodbye")
 
-    def counts(self) -> tuple[int, int]:
-        """How many answers came late, and how often memory was asked for."""
-        n_late, n_allocations = self.call("counts")
-        return int(n_late), int(n_allocations)
+    def counts(self) -> Counts:
+        """Since the client was made."""
+        return Counts(*map(int, self.call("counts")))
 
 
 def _hex(argument: bytes | None) -> str:

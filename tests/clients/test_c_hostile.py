@@ -150,15 +150,35 @@ def test_arguments_that_cannot_be_sent_are_not(built: Path) -> None:
 def test_nobody_there_and_nobody_answering(built: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         url = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
-        for spin_us in (0, 10_000):  # polling or asleep
-            with CClient(built, url, timeout_ms=8, spin_us=spin_us) as client, pytest.raises(Refused, match="TIMEOUT"):
-                client.hello()
+        with CClient(built, url, timeout_ms=50) as client, pytest.raises(Refused, match="TIMEOUT"):
+            client.hello()
         for spin_us in (-1, 10_001):
             with pytest.raises(Refused, match="BAD_ARGUMENT"), CClient(built, url, spin_us=spin_us):
                 pass
     for nobody in (url, f"unix://{tmp_path}/none"):
         with pytest.raises(Refused, match="SYSTEM"), CClient(built, nobody):
             pass
+
+
+def test_who_polls_does_not_sleep_before_its_time_nor_past_the_timeout(built: Path) -> None:
+    """Nobody answers, and each look at the client's own clock takes it 1 ms on."""
+    told = {"timeout_ms": 100, "look_step_ns": 10**6}
+    counts = {}
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        url = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
+        for spin_us in (0, 10_000):
+            with CClient(built, url, spin_us=spin_us, **told) as client:
+                with pytest.raises(Refused, match="TIMEOUT"):
+                    client.hello()
+                counts[spin_us] = client.counts()
+        with CClient(built, url, spin_us=10_000, **{**told, "timeout_ms": 5}) as client:
+            with pytest.raises(Refused, match="TIMEOUT"):
+                client.hello()
+            timed_out = client.counts()
+    assert counts[0].yields == 0 < counts[0].sleeps
+    assert 0 < counts[10_000].yields <= 10
+    assert counts[10_000].sleeps > 0  # the rest of its timeout
+    assert (timed_out.yields <= 5, timed_out.sleeps) == (True, 0)
 
 
 def test_an_answer_is_late_by_the_engines_clock_whatever_it_says(built: Path) -> None:
@@ -169,14 +189,15 @@ def test_an_answer_is_late_by_the_engines_clock_whatever_it_says(built: Path) ->
         late = [client.turn("query", BOTS, 7, free=FREE, deadline_us=us).late for us in (1000.0, 999.0, None)]
         late.append(client.turn("act", BOTS, 7, acquired=NONE, costly=COSTLY, deadline_us=0.0).late)
         assert late == [False, True, False, True]
-        assert client.counts()[0] == 2
+        assert client.counts().late == 2
     default = frame_of(plain("welcome", deadline_us=999.0))
     turn = answered(built, default, QUERIES, clock_step_ns=10**6)
     assert isinstance(turn, Turn)
     assert turn.late
 
 
-def test_a_reply_may_come_byte_by_byte(built: Path) -> None:
+@pytest.mark.parametrize("spin_us", [0, 10_000])
+def test_a_reply_may_come_byte_by_byte(built: Path, spin_us: int) -> None:
     def dribble(listening: socket.socket) -> None:
         accepted, _ = listening.accept()
         with accepted:
@@ -189,7 +210,7 @@ def test_a_reply_may_come_byte_by_byte(built: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         thread = threading.Thread(target=dribble, args=[listening], daemon=True)
         thread.start()
-        with CClient(built, f"tcp://127.0.0.1:{listening.getsockname()[1]}") as client:
+        with CClient(built, f"tcp://127.0.0.1:{listening.getsockname()[1]}", spin_us=spin_us) as client:
             client.hello()
             assert client.turn("query", BOTS, 7, free=FREE).infer_us == 80.25
         thread.join()

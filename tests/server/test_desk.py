@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -26,6 +27,18 @@ def test_a_turn_that_is_known_to_be_quick_stays_on_the_loop(at_desk: Callable[..
         assert [await counter.query(bots[:1]) for _ in range(3)] == [False, True, True]
         assert [await counter.query(bots) for _ in range(3)] == [False, True, True]  # another size, unknown at first
         assert [await counter.query(bots[:5]) for _ in range(3)] == [False, True, True]
+
+    at_desk(test)
+
+
+def test_what_was_answered_on_the_loop_is_counted_soon_after(at_desk: Callable[..., None]) -> None:
+    async def test(counter: Counter) -> None:
+        recorder, bots = counter.desk.handlers.recorder, await counter.start(1)
+        assert [await counter.query(bots) for _ in range(2)] == [False, True]
+        for _ in range(4):
+            await asyncio.sleep(0)
+        assert not recorder._noted
+        assert sum(histograms.bots for histograms in recorder._answers.values()) == 2
 
     at_desk(test)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 
 from server.looks import Looks
 
@@ -71,14 +72,23 @@ def test_who_leaves_its_turn_leaves_it_to_the_next() -> None:
 def test_what_can_wait_is_done_when_nothing_else_waits() -> None:
     async def main() -> None:
         done: list[str] = []
-        looks = Looks(afterwards=lambda: done.append("afterwards"))
-        looks.take()
-        assert not done  # what was answered in this look has not left yet
+        looks, loop = Looks(afterwards=lambda: done.append("afterwards")), asyncio.get_running_loop()
+
+        def job(name: str) -> None:
+            looks.take()
+            done.append(name)
+            outcome: asyncio.Future[None] = loop.create_future()
+            outcome.add_done_callback(lambda _: done.append(f"{name} has left"))
+            outcome.set_result(None)
+
+        job("at once")
         for name in ("first", "second"):
-            looks.put(lambda name=name: (looks.take(), done.append(name)), 1.0)
-        for look in range(1, 4):
+            looks.put(partial(job, name), 1.0)
+        for _ in range(6):
             await asyncio.sleep(0)
-            assert done == ["first", "second", "afterwards"][:look]
+        names = [f"{name}{left}" for name in ("at once", "first", "second") for left in ("", " has left")]
+        assert sorted(done[:-1]) == sorted(names)
+        assert done[-1] == "afterwards"
 
     asyncio.run(main())
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -42,6 +44,26 @@ def test_what_was_noted_is_counted_once_by_whoever_reads_and_never_waits_in_numb
             recorder.settle()
             assert not recorder._noted
     assert [sum(recorder.answers["tcp", RequestQueries].counts[WHOLE]) for _ in range(2)] == [200, 200]
+
+
+def test_threads_that_answer_settle_and_read_lose_nothing() -> None:
+    recorder, reply = Recorder(), Queries(frame=1, queries=b"", cost_us=[], infer_us=1.0)
+
+    def answer() -> None:
+        for _ in range(3000):
+            recorder.answered("tcp", REQUEST, reply, Spans(1, 2, 3, 6))
+
+    def look() -> None:
+        for _ in range(300):
+            recorder.settle()
+            assert not recorder.answers or recorder.answers["tcp", RequestQueries].bots % 3 == 0
+
+    with ThreadPoolExecutor(4) as pool:
+        for done in [pool.submit(work) for work in (answer, look, answer, look)]:
+            done.result()
+    histograms = recorder.answers["tcp", RequestQueries]
+    assert [sum(counts) for counts in histograms.counts] == [6000] * 5
+    assert histograms.totals == [6000, 12000, 6_000_000, 18000, 36000]
 
 
 def test_what_is_no_turn_has_no_phases() -> None:
