@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -37,8 +38,11 @@ def test_one_that_takes_too_long_is_ended(bundle: Path) -> None:
 
 def _children() -> set[str]:
     """The processes that this one has started and not waited for: other tests' may be among them."""
-    tasks = Path(f"/proc/{os.getpid()}/task")
-    return {child for task in tasks.iterdir() for child in (task / "children").read_text().split()}
+    children: set[str] = set()
+    for task in Path(f"/proc/{os.getpid()}/task").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):  # a thread that has ended in the meantime
+            children.update((task / "children").read_text().split())
+    return children
 
 
 def test_the_process_is_bounded(bundle: Path) -> None:
