@@ -10,6 +10,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bot_runtime.costs import Costs
 from protocol.errors import NoBot, NoConnection, TooManyConnections
 from protocol.features import CostModel
@@ -23,7 +26,7 @@ class Connection:
     """One engine's link to the server; it alone may name its bots, which are bots of `serving`.
 
     `costs` are as it declared, then as it measures. `is_pinned` where the engine named the very version: no other will
-    do.
+    do. `asked` is the last query that it was sent, as its reply has it and as bool [N, M].
     """
 
     id: str
@@ -32,11 +35,18 @@ class Connection:
     last_seen_s: float
     is_pinned: bool = False
     bots: set[int] = field(default_factory=set)
+    asked: tuple[object, NDArray[np.bool_]] | None = None
 
     @property
     def measured_costs(self) -> Costs | None:
         """None as long as nothing was measured: the costs are then those of the bots' start, which are at hand."""
         return self.costs if self.costs.n_frames else None
+
+    def query_of(self, packed: object, n_bots: int) -> NDArray[np.bool_] | None:
+        """The last query of so many bots if this is it: what is acquired mostly is, and need not be read again."""
+        if self.asked is None or len(self.asked[1]) != n_bots or self.asked[0] != packed:
+            return None
+        return self.asked[1]
 
     def check_owns(self, handles: Sequence[int]) -> None:
         """Raise NoBot for a bot that is not this connection's."""

@@ -154,7 +154,7 @@ class Handlers:
         if serving is not connection.serving:
             self.servings.hold(serving)
             self.servings.release(connection.serving)
-            connection.serving = serving
+            connection.serving, connection.asked = serving, None
         connection.bots.update(handles)
         return BotsStarted(bots=handles, bundle_version=serving.version, bundle_sha256=serving.sha256)
 
@@ -183,7 +183,9 @@ class Handlers:
             connection.measured_costs,
             deadline,
         )
-        return written(turn, form)
+        reply = written(turn, form)
+        connection.asked = reply.queries, turn.query_NM
+        return reply
 
     def _submit_features(
         self, request: SubmitFeatures, connection: Connection, form: Format, deadline: Deadline | None
@@ -192,7 +194,9 @@ class Handlers:
         _check_deadline(request.deadline_us)
         serving = connection.serving
         shape = len(request.bots), serving.table.n_queries
-        acquired_NM = arrays.bits(request.acquired, shape, "acquired")
+        acquired_NM = connection.query_of(request.acquired, shape[0])
+        if acquired_NM is None:
+            acquired_NM = arrays.bits(request.acquired, shape, "acquired")
         failed_NM = None if request.failed is None else arrays.bits(request.failed, shape, "failed")
         costly_ND = arrays.unpack_values(request.values, acquired_NM, serving.table)
         handles_N = np.array(request.bots, dtype=np.int64)

@@ -5,6 +5,8 @@ This module knows nothing about requests, connections or bytes.
 
 from __future__ import annotations
 
+from typing import overload
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,16 @@ from protocol.codec import Format
 from protocol.messages import Actions, Queries
 
 __all__ = ["written"]
+
+
+@overload
+def written(result: turns.Queries, form: Format, hidden_NW: None = None) -> Queries: ...
+
+
+@overload
+def written(
+    result: turns.Queries | turns.Actions, form: Format, hidden_NW: NDArray[np.float32] | None = None
+) -> Queries | Actions: ...
 
 
 def written(

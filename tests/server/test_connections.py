@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from protocol.errors import NoBot, NoConnection, TooManyConnections
@@ -36,6 +37,16 @@ def test_limits_and_names(serving: Serving) -> None:
     assert connections.remove(only.id) is only
     assert connections.remove(only.id) is None
     assert connections.open(COSTS, serving).id != only.id
+
+
+def test_the_last_query_is_known_by_what_was_sent_of_it(serving: Serving) -> None:
+    connection = Connections(1, 10.0, FakeClock()).open(COSTS, serving)
+    query_NM = np.array([[True, False], [False, True]])
+    assert connection.query_of(b"\x01\x02", 2) is None
+    connection.asked = b"\x01\x02", query_NM
+    assert connection.query_of(b"\x01\x02", 2) is query_NM
+    for packed, n_bots in ((b"\x01\x00", 2), (b"\x01\x02", 1), ([[1, 0], [0, 1]], 2)):
+        assert connection.query_of(packed, n_bots) is None
 
 
 def test_names_begin_with_the_process_that_holds_them(serving: Serving) -> None:
