@@ -12,8 +12,10 @@ from bot_runtime.bundle import Bundle
 from game.env import ACTION_SPEC, feature_table
 from training.config import TrainConfig
 from training.evaluate import EvaluateConfig, evaluate
+from training.feature_map import FEATURE_MAP, FeatureMap
 
 BUNDLES = Path(__file__).parent.parent / "bundles"
+LOCOMOTION = {"halfcheetah": "HalfCheetah-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v5"}
 
 
 @pytest.mark.parametrize(("name", "precision"), [("easy", "fp32"), ("hard", "fp32"), ("hard-int8", "int8")])
@@ -25,7 +27,15 @@ def test_verifies_and_is_made_for_this_game(name: str, precision: str) -> None:
     assert manifest.provenance["environment"] == f"game.env:Navigation-{name.removesuffix('-int8')}-v0"
 
 
-@pytest.mark.parametrize("name", ["easy", "hard"])
+@pytest.mark.parametrize(("name", "environment"), LOCOMOTION.items())
+def test_verifies_and_reads_the_map_that_we_ship(name: str, environment: str) -> None:
+    manifest = Bundle.load(BUNDLES / name).manifest
+    assert (manifest.name, manifest.provenance["environment"]) == (name, environment)
+    shipped = FeatureMap.read(BUNDLES.parent / "training" / "feature_maps" / f"{name}.json")
+    assert FeatureMap.read(BUNDLES / name / FEATURE_MAP) == shipped
+
+
+@pytest.mark.parametrize("name", ["easy", "hard", *LOCOMOTION])
 def test_was_made_by_the_configuration_that_we_ship(name: str) -> None:
     """But for the folder and the name of the run: the bundles are runs of the sweep."""
     shipped = TrainConfig.read(BUNDLES.parent / "training" / "configs" / f"{name}.json")
@@ -40,6 +50,17 @@ def test_recorded_evaluation_meets_the_bar(name: str) -> None:
     assert recorded["episodes"] == full["episodes"] == len(recorded["returns"]) == 256
     assert recorded["return_mean"] >= 0.9 * full["return_mean"]
     assert recorded["hard_cost_pct"] <= 20.0
+    assert recorded["violations"] == 0
+
+
+@pytest.mark.parametrize("name", LOCOMOTION)
+def test_recorded_locomotion_is_near_its_expert_within_its_budget(name: str) -> None:
+    """100 is D4RL's expert; the experts of the traces earned 89.6 to 100.5."""
+    recorded = json.loads((BUNDLES / name / "evaluation.json").read_text())
+    assert recorded["bundle"] == name
+    assert recorded["episodes"] == len(recorded["returns"]) == 256
+    assert recorded["normalised_mean"] >= 85.0
+    assert recorded["soft_cost_pct"] <= 100.0 * recorded["trained_budget"]
     assert recorded["violations"] == 0
 
 
@@ -64,3 +85,13 @@ def test_hard_still_plays() -> None:
     same = sum(abs(episode.total - was) < 0.01 for episode, was in zip(episodes, recorded, strict=True))
     assert same >= 5
     assert evaluation.return_mean > 45.0
+
+
+def test_a_cheetah_still_runs_on_half_of_its_numbers() -> None:
+    """Four episodes of a thousand steps; half of the numbers drawn at random give 4.1. Falls are what differs between
+    processors, and one episode in seventeen has one: two of four may fall."""
+    evaluation, episodes = evaluate(EvaluateConfig(BUNDLES / "halfcheetah", episodes=4, workers=1))
+    assert evaluation.normalised_mean is not None
+    assert sum(episode.total > 9_000.0 for episode in episodes) >= 2
+    assert evaluation.soft_cost_pct <= 60.0
+    assert evaluation.violations == 0
