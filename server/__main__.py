@@ -18,6 +18,7 @@ import uvloop
 
 from protocol.errors import BadBundle
 from server.app import running
+from server.aside import Aside
 from server.logs import configure, logger
 from server.settings import Settings
 
@@ -52,14 +53,15 @@ def _write(path: Path, content: dict[str, str | int]) -> None:
 
 def main() -> None:
     """Parse the command line and serve. Exits with 2 for settings or a bundle that cannot be served."""
-    configure(None)
-    try:
-        settings = tyro.cli(Settings, description="Serve bundles to game engines.")
-        configure(settings.log_json)
-        uvloop.run(_serve(settings))
-    except (ValueError, BadBundle, OSError) as error:
-        _log.error(str(error))
-        sys.exit(2)
+    with Aside(sys.stderr.fileno()) as stream:
+        configure(None, stream)
+        try:
+            settings = tyro.cli(Settings, description="Serve bundles to game engines.")
+            configure(settings.log_json, stream)
+            uvloop.run(_serve(settings))
+        except (ValueError, BadBundle, OSError) as error:
+            _log.error(str(error))
+            sys.exit(2)
 
 
 if __name__ == "__main__":

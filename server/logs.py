@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import sys
 import time
 from collections.abc import Callable
-from typing import TextIO
+from typing import Protocol
 
 import structlog
 from structlog.typing import Processor
 
-__all__ = ["Flood", "configure", "digest", "logger"]
+__all__ = ["Flood", "Lines", "configure", "digest", "logger"]
 
 _MAX_EVENTS = 256
 
@@ -40,7 +39,14 @@ def digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()[:8]
 
 
-def configure(as_json: bool | None, stream: TextIO = sys.stderr) -> None:
+class Lines(Protocol):
+    """Where lines go: a text file, or `server.aside.Aside`."""
+
+    def isatty(self) -> bool: ...
+    def write(self, line: str, /) -> object: ...
+
+
+def configure(as_json: bool | None, stream: Lines) -> None:
     """Log everything from INFO on to `stream`; None: as JSON unless a person is watching it."""
     if as_json is None:
         as_json = not stream.isatty()

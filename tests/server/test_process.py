@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import array
+import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -66,6 +69,23 @@ def test_it_ends_though_clients_hold_half_sent_requests(bundle: Path, tmp_path: 
             server.terminate()
             _, err = server.communicate(timeout=20)
         assert server.returncode == 0, err
+
+
+def test_a_log_that_nobody_reads_stops_no_bot(bundle: Path, tmp_path: Path) -> None:
+    with process(bundle, tmp_path) as (server, addresses):
+        assert server.stderr is not None
+        holds = fcntl.fcntl(server.stderr.fileno(), fcntl.F_SETPIPE_SZ, 4096)
+        for _ in range(holds // 100):  # two lines each, until the flood is cut: 40 lines of 100 bytes and more
+            with BotClient(addresses["tcp"]) as client:
+                client.hello()
+        with BotClient(addresses["unix"]) as client:
+            client.hello()
+            play(client, TABLE, client.start(2), range(20))
+        server.terminate()
+        assert server.wait(timeout=20) == 0
+        waiting = array.array("i", [0])
+        fcntl.ioctl(server.stderr.fileno(), termios.FIONREAD, waiting)
+        assert waiting[0] > holds - 400  # it was full indeed
 
 
 def test_health_readiness_and_the_bundle(bundle: Path, tmp_path: Path) -> None:
