@@ -6,10 +6,14 @@ import dataclasses
 import json
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 
 from bot_runtime.bundle import Bundle
 from game.env import ACTION_SPEC, feature_table
+from protocol.client import BotClient
+from tests.server.serving import serve
 from training.config import TrainConfig
 from training.evaluate import EvaluateConfig, evaluate
 from training.feature_map import FEATURE_MAP, FeatureMap
@@ -95,3 +99,22 @@ def test_a_cheetah_still_runs_on_half_of_its_numbers() -> None:
     assert sum(episode.total > 9_000.0 for episode in episodes) >= 2
     assert evaluation.soft_cost_pct <= 60.0
     assert evaluation.violations == 0
+
+
+def test_walkers_walk_over_a_socket(tmp_path: Path) -> None:
+    """Four of them for six seconds of their lives, from gymnasium straight to a server; one in eight may fall. No
+    feature is free: a frame's first message tells rewards alone."""
+    envs = [gymnasium.make("Walker2d-v5") for _ in range(4)]
+    costly = np.stack([env.reset(seed=i)[0] for i, env in enumerate(envs)]).astype(np.float32)
+    rewards, speeds = np.zeros(4, np.float32), []
+    with serve(BUNDLES / "walker2d", tmp_path / "s") as server, BotClient(server.addresses["unix"]) as client:
+        assert client.hello().features.n_free == 0
+        bots = client.start(4)
+        for frame in range(300):
+            queries = client.query(bots, frame, np.zeros((4, 0), np.float32), rewards).queries
+            actions = client.act(bots, frame, queries, np.where(queries, costly, np.float32(0.0))).actions
+            steps = [env.step(action) for env, action in zip(envs, actions, strict=True)]
+            costly = np.array([step[0] for step in steps], np.float32)
+            rewards = np.array([step[1] for step in steps], np.float32)
+            speeds.append([step[4]["x_velocity"] for step in steps])
+    assert sum(np.mean(speeds[100:], axis=0) > 2.0) >= 2  # m/s; who has fallen lies still
