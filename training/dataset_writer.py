@@ -20,6 +20,7 @@ from minari.dataset.minari_dataset import DATASET_ID_RE
 from minari.dataset.minari_storage import MinariStorage
 
 from training.episodes import Episode
+from training.sink import Sink
 
 __all__ = ["DatasetWriter"]
 
@@ -41,7 +42,8 @@ class DatasetWriter:
         self._out = out
         self._scratch = tempfile.TemporaryDirectory(dir=out.parent, prefix=".dataset-")
         self._main = Path(self._scratch.name) / "main.hdf5"
-        self._file = h5py.File(self._main, "w", track_order=True)
+        self._sink = Sink(self._main)
+        self._file = h5py.File(self._sink, "w", track_order=True)
 
     def __enter__(self) -> Self:
         return self
@@ -50,10 +52,12 @@ class DatasetWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._file.close()
+        self._sink.close()
         self._scratch.cleanup()
 
     def add(self, episode: Episode) -> None:
-        """Write the groups that Minari reads, compressed, as game/recording.py does."""
+        """Write the groups that Minari reads, compressed, as game/recording.py does. Raises OSError, for a full disk
+        soon after it is full."""
         n = len(episode.rewards)
         last_T = np.arange(n) == n - 1
         group = self._file.create_group(f"episode_{self.episodes}")
@@ -64,12 +68,15 @@ class DatasetWriter:
             group.create_dataset(name, data=values, **packing)
         group["actions"], group["rewards"] = episode.actions, episode.rewards
         group["terminations"], group["truncations"] = last_T & episode.terminated, last_T & episode.truncated
+        self._sink.check()
         self.episodes += 1
         self.steps += n
 
     def finish(self, spaces: tuple[Space, Space], metadata: dict[str, Any], env_spec: EnvSpec | None = None) -> None:
-        """Give the dataset its spaces (of observations, of actions), its metadata and its name."""
+        """Give the dataset its spaces (of observations, of actions), its metadata and its name. Raises OSError."""
         self._file.close()
+        self._sink.check()
+        self._sink.close()
         folder = Path(self._scratch.name) / self._out.name
         folder.mkdir()
         storage = MinariStorage.new(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
+import subprocess
+import sys
 import tempfile
 import tracemalloc
 from pathlib import Path
@@ -27,6 +29,7 @@ from training.import_traces import ImportConfig, Imported, import_traces, main
 from training.rows import SourceError
 from training.traces import load_traces
 
+ROOT = Path(__file__).resolve().parents[2]
 SEVERAL = rows(3, 1, 4)
 
 
@@ -261,3 +264,16 @@ def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
         source.write_text(log)
         lengths.append(imported(tmp_path, source, msgspec.json.decode(columns, type=ColumnMap))[0].lengths)
     assert lengths == [(2, 3), (2,)]
+
+
+@pytest.mark.parametrize("kib", [1, 20, 200])
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path: Path, kib: int) -> None:
+    """`ulimit -f` refuses what a full disk would. In a process of its own: HDF5 itself would end it with a signal."""
+    write_csv(tmp_path / "log.csv", rows(*[400] * 30))
+    (tmp_path / "columns.json").write_bytes(msgspec.json.encode(column_map()))
+    command = f"ulimit -f {kib}; exec {sys.executable} -m training.import_traces log.csv big-v0 --columns columns.json"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    run = subprocess.run(["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert run.returncode == 1
+    assert [line for line in run.stderr.splitlines() if line] == ["error: [Errno 27] File too large"]
+    assert sorted(os.listdir(tmp_path)) == ["columns.json", "log.csv"]
