@@ -23,7 +23,12 @@ __all__ = ["file_entries", "new_folder", "write_manifest"]
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """An empty folder that replaces `out` when the block ends without an exception; else nothing changes."""
+    """An empty folder that replaces `out` when the block ends without an exception; else nothing changes.
+
+    Raises ValueError where `out` holds other things than a bundle, which nobody wants replaced.
+    """
+    if out.exists() and not (out / MANIFEST_FILE).is_file() and not (out.is_dir() and not any(out.iterdir())):
+        raise ValueError(f"{out} is there and is no bundle, expected a new folder or a bundle to replace")
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as scratch:
         folder = Path(scratch) / out.name

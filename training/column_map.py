@@ -11,6 +11,7 @@ A action numbers, X numbers of a timestep.
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections import Counter
 from functools import cached_property
@@ -129,7 +130,7 @@ class ColumnMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
         if len(text) > _MAX_MAP_BYTES:
             raise ValueError(f"{path} is longer than {_MAX_MAP_BYTES} bytes, the most that a column map may have")
         try:
-            return msgspec.json.decode(text, type=cls)
+            return msgspec.json.decode(text.removeprefix(codecs.BOM_UTF8), type=cls)
         except (ValueError, RecursionError) as error:
             raise ValueError(f"{path}: {error}") from error
 

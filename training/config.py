@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
@@ -138,7 +139,7 @@ class TrainConfig:
     def read(cls, path: Path) -> TrainConfig:
         """Read a configuration written by `write` or by hand. Raises ValueError, for unknown settings too."""
         try:
-            data = msgspec.json.decode(path.read_bytes(), type=dict[str, object])
+            data = msgspec.json.decode(path.read_bytes().removeprefix(codecs.BOM_UTF8), type=dict[str, object])
             if unknown := set(data) - {field.name for field in fields(cls)}:
                 raise ValueError(f"unknown settings {sorted(unknown)}")
             return msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))

@@ -136,14 +136,26 @@ def _features(metadata: dict[str, Any], sizes: Mapping[str, int]) -> FeatureTabl
 
 
 def _sizes(space: dict[str, Any]) -> dict[str, int]:
-    """How many numbers each part of an observation has."""
-    parts = space["subspaces"] if space["type"] == "Dict" else {"": space}
-    sizes = {}
-    for key, part in parts.items():
-        if part["type"] != "Box":
-            raise ValueError(f"observation {key!r} is a {part['type']}, expected a Box or a Dict of them")
-        sizes[key] = int(np.prod(part["shape"], dtype=np.int64))
-    return sizes
+    """How many numbers each part of an observation has. Parts of a Dict that have none, such as texts and other Dicts,
+    are left out: a feature map cannot name them."""
+    if space["type"] == "Dict":
+        sizes = {key: _numbers(part) for key, part in space["subspaces"].items()}
+        return {key: size for key, size in sizes.items() if size is not None}
+    size = _numbers(space)
+    if size is None:
+        raise ValueError(f"the observation is a {space['type']}, expected numbers or a Dict of them")
+    return {"": size}
+
+
+def _numbers(space: dict[str, Any]) -> int | None:
+    """How many numbers a value of this space is; None: it is something else."""
+    if space["type"] == "Box":
+        return int(np.prod(space["shape"], dtype=np.int64))
+    if space["type"] == "MultiBinary":
+        return int(np.prod(space["n"], dtype=np.int64))
+    if space["type"] == "MultiDiscrete":
+        return np.array(space["nvec"]).size
+    return 1 if space["type"] == "Discrete" else None
 
 
 def _action(metadata: dict[str, Any], space: dict[str, Any]) -> ActionSpec:

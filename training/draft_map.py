@@ -8,6 +8,7 @@ multiple of the number's own over the recorded episodes.
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,8 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from training.datasets import Dataset, TracesError, observation_sizes, open_dataset
+from training.command import command
+from training.datasets import Dataset, observation_sizes, open_dataset
 from training.feature_map import FeatureMap, MappedFeature
 
 __all__ = ["Copy", "DraftConfig", "draft_map"]
@@ -54,14 +56,18 @@ class DraftConfig:
     def __post_init__(self) -> None:
         if self.out.exists():
             raise ValueError(f"{self.out} exists: a map that was edited is not overwritten")
+        if not self.out.parent.is_dir():
+            raise ValueError(f"{self.out.parent} is not a folder, expected the one that {self.out.name} goes into")
+        for text in self.copies:
+            Copy.parse(text)
 
 
 def draft_map(config: DraftConfig) -> FeatureMap:
-    """One feature a number and copy. Raises ValueError, TracesError."""
+    """One feature a number and copy. Raises ValueError, TracesError too, for what training would refuse."""
     sizes = observation_sizes(config.dataset)
     copies = [Copy.parse(text) for text in config.copies] or [Copy("", config.cost_us, 0.0)]
     numbers = [(key, i) for key, size in sizes.items() for i in range(size)]
-    names = config.names or tuple(f"{key or 'number'}_{i}" for key, i in numbers)
+    names = config.names or tuple(f"{_as_name(key)}_{i}" for key, i in numbers)
     if len(names) != len(numbers):
         raise ValueError(f"names are {len(names)}, the observation has {len(numbers)} numbers")
     plain = FeatureMap(
@@ -79,7 +85,15 @@ def draft_map(config: DraftConfig) -> FeatureMap:
         full = f"{name}_{copy.group}" if len(copies) > 1 else name
         noise = float(f"{copy.noise * deviation:.4g}")
         features.append(MappedFeature(full, (i,), key, copy.cost_us, noise, copy.group))
-    return FeatureMap(tuple(features))
+    drafted = FeatureMap(tuple(features))
+    drafted.table(sizes)
+    return drafted
+
+
+def _as_name(key: str) -> str:
+    """A part's key as a feature may be called."""
+    name = re.sub(r"[^a-z0-9_]", "_", key.lower())
+    return name if name[:1].isalpha() else f"number{name}"
 
 
 def _deviations(dataset: Dataset) -> np.ndarray:
@@ -88,14 +102,12 @@ def _deviations(dataset: Dataset) -> np.ndarray:
     return np.concatenate([dataset.episode(i).costly_TD for i in episodes]).std(axis=0)
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Command line."""
-    config = tyro.cli(DraftConfig, description=__doc__)
-    try:
+    with command():
+        config = tyro.cli(DraftConfig, args=arguments, description=__doc__)
         drafted = draft_map(config)
-    except TracesError as error:
-        raise SystemExit(str(error)) from error
-    drafted.write(config.out)
+        drafted.write(config.out)
     Console().print(f"{config.out}: {len(drafted.features)} features; edit their names, costs and groups")
 
 

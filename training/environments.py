@@ -63,8 +63,14 @@ class Paying(Protocol):
 
 
 def open_environment(name: str, owner_D: NDArray[np.int64], feature_map: FeatureMap | None = None) -> Environment:
-    """Make the environment with this gymnasium id; `owner_D` says which costly feature each costly number is of."""
-    env = gymnasium.make(name)
+    """Make the environment with this gymnasium id; `owner_D` says which costly feature each costly number is of.
+
+    Raises ValueError for an id that is not known, or whose module or simulator is not installed.
+    """
+    try:
+        env = gymnasium.make(name)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ValueError(f"environment {name}: {error}") from error
     if feature_map is not None:
         return _Mapped(env, owner_D, feature_map)
     bare = env.unwrapped
@@ -125,17 +131,18 @@ class _Mapped(_Whole):
         super().__init__(env, owner_D)
         self._map, self._chance = feature_map, np.random.default_rng()
         self._is_choice = isinstance(env.action_space, gymnasium.spaces.Discrete)
+        self._whole = env.action_space.dtype if np.issubdtype(env.action_space.dtype, np.integer) else None
 
     def restart(self, seed: int) -> None:
         self._chance = np.random.default_rng(seed)  # of the noise, before the first observation
         super().restart(seed)
 
     def _split(self, observation: Any) -> dict[str, _Floats]:
-        alone = (
-            {key: part[None] for key, part in observation.items()} if isinstance(observation, dict) else [observation]
-        )
+        alone = {key: [part] for key, part in observation.items()} if isinstance(observation, dict) else [observation]
         free_1F, costly_1D = self._map.split(parts_of(alone, 1), self._chance)
         return {"free": free_1F[0], "costly": costly_1D[0]}
 
     def _action(self, action_A: _Floats) -> Any:
-        return round(float(action_A[0])) if self._is_choice else action_A
+        if self._is_choice:
+            return round(float(action_A[0]))
+        return action_A if self._whole is None else np.rint(action_A).astype(self._whole)

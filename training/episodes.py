@@ -101,7 +101,7 @@ class _Form:
             return None
         step = cells[self._at[self._columns.timestep]]
         if type(step) not in (int, float) or not abs(step) <= _LARGEST_TIMESTEP or step != int(step):
-            raise _wrong(self._columns.timestep, step, "a whole number")
+            raise _wrong(self._columns.timestep, step, "a whole number of at most 2^53")
         return int(step)
 
     def _flag(self, column: str | None, cells: Sequence[object]) -> bool:

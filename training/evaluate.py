@@ -23,6 +23,7 @@ from rich.progress import Progress
 from bot_runtime.bundle import Bundle
 from bot_runtime.manifest import Manifest
 from protocol.messages import MAX_RETURN
+from training.command import command
 from training.feature_map import FEATURE_MAP, FeatureMap
 from training.heat_map import HeatSums
 from training.play import Episode, Group, Player, Terms
@@ -235,12 +236,16 @@ def _write_heat_map(path: Path, groups: list[Group], manifest: Manifest) -> None
     total.mean(features.costs_us, tuple(feature.name for feature in features.costly)).write(path)
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Command line: prints one JSON line, and writes it with every episode."""
-    config = tyro.cli(EvaluateConfig, description=__doc__)
-    evaluation, episodes = evaluate(config)
-    write_evaluation(config.out or config.bundle / "evaluation.json", evaluation, episodes)
-    print(msgspec.json.encode(asdict(evaluation)).decode())
+    with command():
+        config = tyro.cli(EvaluateConfig, args=arguments, description=__doc__)
+        for path in (config.out, config.heat_map):
+            if path is not None and not path.parent.is_dir():
+                raise ValueError(f"{path.parent} is not a folder, expected the one that {path.name} goes into")
+        evaluation, episodes = evaluate(config)
+        print(msgspec.json.encode(asdict(evaluation)).decode(), flush=True)
+        write_evaluation(config.out or config.bundle / "evaluation.json", evaluation, episodes)
 
 
 if __name__ == "__main__":

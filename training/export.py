@@ -24,6 +24,7 @@ from bot_runtime.noise import uniforms
 from training.acquisition import rollout, sample_queries
 from training.bundle_folder import file_entries, new_folder, write_manifest
 from training.checkpoint import Trained, load_trained
+from training.command import command, terminable
 from training.config import TrainConfig
 from training.curves import plot_curves
 from training.feature_map import FEATURE_MAP
@@ -163,17 +164,19 @@ def _context_sizes(sizes: ModelConfig) -> dict[str, int]:
     return {name: getattr(sizes, name) for name in names} | {"head_dim": sizes.token[1]} | shared
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Command line."""
-    config, console = tyro.cli(ExportConfig, description=__doc__), Console()
-    if config.int8:
-        bundle, report = export_int8(
-            Int8(config.run, config.out, config.name, config.episodes, config.environment, config.seed)
-        )
-        for line in report_lines(report):
-            console.print(line)
-    else:
-        bundle = export(config)
+    console = Console()
+    with command("stopped: nothing was written"), terminable():
+        config = tyro.cli(ExportConfig, args=arguments, description=__doc__)
+        if config.int8:
+            bundle, report = export_int8(
+                Int8(config.run, config.out, config.name, config.episodes, config.environment, config.seed)
+            )
+            for line in report_lines(report):
+                console.print(line)
+        else:
+            bundle = export(config)
     manifest = bundle.manifest
     console.print(f"bundle {manifest.name}: verified, {sum(file.bytes for file in manifest.files.values()):,} bytes")
 

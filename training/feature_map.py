@@ -12,6 +12,7 @@ module knows nothing about datasets, networks or environments.
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 from collections.abc import Mapping
@@ -33,9 +34,10 @@ Parts = Mapping[str, NDArray[np.floating]]
 
 
 def parts_of(observations: object, timesteps: int) -> Parts:
-    """The first `timesteps` of recorded observations, every part flat."""
+    """The first `timesteps` of recorded observations, every part flat; parts that are no numbers are left out."""
     parts = observations if isinstance(observations, Mapping) else {"": observations}
-    return {str(key): _rows(np.asarray(part)[:timesteps]) for key, part in parts.items()}
+    arrays = {str(key): np.asarray(part) for key, part in parts.items() if not isinstance(part, Mapping | tuple)}
+    return {key: _rows(array[:timesteps]) for key, array in arrays.items() if array.dtype.kind in "fiub"}
 
 
 def _rows(part: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -72,7 +74,7 @@ class FeatureMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=T
     def read(cls, path: Path) -> FeatureMap:
         """Read a file; every error names it."""
         try:
-            return msgspec.json.decode(path.read_bytes(), type=cls)
+            return msgspec.json.decode(path.read_bytes().removeprefix(codecs.BOM_UTF8), type=cls)
         except (OSError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
 
@@ -122,5 +124,6 @@ class FeatureMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=T
     @staticmethod
     def _numbers(one: MappedFeature, parts: Parts, chance: np.random.Generator) -> NDArray[np.float32]:
         chosen = parts[one.key] if one.numbers is None else parts[one.key][:, list(one.numbers)]
-        noise = chance.normal(0.0, one.noise, chosen.shape) if one.noise else 0.0
-        return (chosen + noise).astype(np.float32)
+        if one.noise:  # a copy stays within its range, or a server would refuse what training had read
+            chosen = np.clip(chosen + chance.normal(0.0, one.noise, chosen.shape), one.low, one.high)
+        return chosen.astype(np.float32)

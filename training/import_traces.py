@@ -7,7 +7,6 @@ This module knows nothing about features and their costs.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from training.column_map import LARGEST, ColumnMap
+from training.command import command, terminable
 from training.dataset_writer import DatasetWriter
 from training.episodes import Episode, cut
 from training.rows import Row, RowBatch, SourceError
@@ -140,13 +140,9 @@ def _table(imported: Imported) -> Table:
 def main(arguments: list[str] | None = None) -> None:
     """Command line: a table of what was imported."""
     console = Console()
-    config = tyro.cli(ImportConfig, args=arguments, description=__doc__)
-    try:
+    with command("stopped: nothing was written"), terminable():
+        config = tyro.cli(ImportConfig, args=arguments, description=__doc__)
         imported = import_traces(config, console)
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("stopped: nothing was written")
     console.print(_line(imported, config.out), soft_wrap=True)
     console.print(_table(imported))
 

@@ -7,7 +7,6 @@ to there, and the dataset's metadata say so.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from rich.console import Console
 from protocol.record import Record
 from protocol.recording import Header, RecordingError
 from protocol.recording_reader import Ending, Recording, read_recording
+from training.command import command, terminable
 from training.dataset_writer import DatasetWriter
 from training.episodes import Episode
 
@@ -171,13 +171,9 @@ def _spaces(header: Header) -> tuple[spaces.Dict, spaces.Box]:
 def main(arguments: list[str] | None = None) -> None:
     """Command line: a line for each recording."""
     console = Console(highlight=False)
-    config = tyro.cli(RecordingsConfig, args=arguments, description=__doc__)
-    try:
+    with command("stopped: nothing was written"), terminable():
+        config = tyro.cli(RecordingsConfig, args=arguments, description=__doc__)
         converted = convert(config)
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("stopped: nothing was written")
     for counts in converted:
         console.print(counts.line, soft_wrap=True, markup=False)
     console.print(

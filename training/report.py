@@ -16,6 +16,7 @@ import matplotlib
 import tyro
 from matplotlib.figure import Figure
 
+from training.command import command
 from training.curves import training_figure
 from training.figures import LEAST_ALIVE, Panel, heat_map_figure, performance_figure
 from training.group_table import group_table
@@ -187,7 +188,8 @@ def _range(numbers: Iterable[int]) -> str:
 
 def main() -> None:
     """Command line: prints the path of the report."""
-    print(report(tyro.cli(ReportConfig, description=__doc__)))
+    with command():
+        print(report(tyro.cli(ReportConfig, description=__doc__)))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ written, or not at all. Memory is that of a row group, of the first episodes, an
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,12 +17,13 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
+from training.command import command, terminable
 from training.feature_map import FeatureMap
 from training.shard import ShardWriter, step_bytes
 from training.shard_index import EXAMPLE, GroupSize, ShardIndex, shard_name
 from training.statistics import Tally
 from training.steps import Layout, Recordings, Steps
-from training.traces import EXAMPLES, choose_example
+from training.traces import EXAMPLE_STEPS
 
 __all__ = ["ShardsConfig", "main", "write_shards"]
 
@@ -71,7 +71,8 @@ class _Shards:
     def __init__(self, folder: Path, layout: Layout, shard_mb: float, group_mb: float) -> None:
         self._folder, self._layout = folder, layout
         self._most_steps = [int(mb * 1e6 / step_bytes(layout)) for mb in (group_mb, shard_mb)]
-        self._tally, self._first_episodes = Tally(), []
+        self._tally = Tally()
+        self._example: Steps | None = None  # how the first of the longest episodes begins
         self._group: list[Steps] = []  # episodes that are not written yet,
         self._n_steps = 0  # and their timesteps
         self._sizes: list[list[GroupSize]] = []
@@ -80,9 +81,9 @@ class _Shards:
 
     def add(self, episode: Steps) -> None:
         self._tally.add(episode)
-        if len(self._first_episodes) < EXAMPLES:
-            self._first_episodes.append(episode)
         n_steps = len(episode.returns_to_go_T)
+        if self._example is None or len(self._example.returns_to_go_T) < min(n_steps, EXAMPLE_STEPS):
+            self._example = episode.part(slice(0, EXAMPLE_STEPS))
         if self._group and self._n_steps + n_steps > self._most_steps[0]:
             self._write_group()
         self._group.append(episode)
@@ -90,11 +91,11 @@ class _Shards:
 
     def finish(self) -> ShardIndex:
         """Write what is left, and the index. Raises ValueError when there was no episode."""
-        if not self._group:
+        if self._example is None:
             raise ValueError(f"{self._folder.name}: no episodes, expected one or more")
         self._write_group()
         self._close()
-        example, layout = choose_example(self._first_episodes), self._layout
+        example, layout = self._example, self._layout
         writer = ShardWriter(self._folder / EXAMPLE, layout)
         writer.write(0, [example])
         writer.close()
@@ -129,15 +130,13 @@ class _Shards:
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line."""
-    config = tyro.cli(ShardsConfig, args=arguments, description=__doc__)
-    try:
+    with command("stopped: nothing was written"), terminable():
+        config = tyro.cli(ShardsConfig, args=arguments, description=__doc__)
         feature_map = None if config.feature_map is None else FeatureMap.read(config.feature_map)
         *datasets, out = config.paths
         recordings = Recordings(datasets, config.episodes, feature_map)
         episodes = track(recordings, description=f"reading {recordings.names}")
         index = write_shards(recordings.layout, episodes, out, config.shard_mb, config.group_mb)
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
     n_groups = sum(map(len, index.shards))
     counts = f"{index.statistics.n_episodes} episodes, {index.statistics.n_steps} timesteps"
     Console().print(f"{out}: {counts} in {len(index.shards)} shards of {n_groups} row groups", soft_wrap=True)

@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from bot_runtime.bundle import Bundle
 from bot_runtime.contents import MANIFEST_FILE, MAX_MANIFEST_BYTES, SIGNATURE_FILE, read_file
 from bot_runtime.signature import Keys
+from training.command import command
 
 __all__ = ["SignConfig", "main", "sign"]
 
@@ -58,8 +59,9 @@ def _read_private_key(path: Path) -> Ed25519PrivateKey:
 
 def main() -> None:
     """Command line."""
-    config = tyro.cli(SignConfig, description=__doc__)
-    print(f"{config.bundle / SIGNATURE_FILE}: signed by key {sign(config)}")
+    with command():
+        config = tyro.cli(SignConfig, description=__doc__)
+        print(f"{config.bundle / SIGNATURE_FILE}: signed by key {sign(config)}")
 
 
 if __name__ == "__main__":

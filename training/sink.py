@@ -14,7 +14,8 @@ __all__ = ["Sink"]
 
 
 class Sink(io.RawIOBase):
-    """A new file for `h5py.File`. After the first write that fails nothing is written any more, and reads give zeros."""
+    """A new file for `h5py.File`. After the first write that fails no other is tried, and what is not there reads as
+    zeros."""
 
     def __init__(self, path: Path) -> None:
         """Raises OSError."""

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from protocol.features import ActionSpec, FeatureTable
+from protocol.features import ActionSpec, Feature, FeatureTable
+from protocol.messages import MAX_RETURN
 from training.datasets import Dataset, TracesError, open_dataset
 from training.feature_map import FeatureMap
 
@@ -104,11 +105,33 @@ def _read(dataset: Dataset, i: int) -> Steps:
     if not n:
         raise TracesError(f"{where} has no timesteps, expected 1 or more")
     rewards = _rows(where, "rewards", read.rewards_T, (n,), np.float64)
-    return Steps(
+    togo_T = returns_to_go(rewards.numpy())
+    if not np.abs(togo_T).max() <= MAX_RETURN:
+        raise TracesError(f"{where}: its return is {togo_T[0]:g}, expected at most {MAX_RETURN:g} either way")
+    steps = Steps(
         _rows(where, "free", read.free_TF, (n, features.n_free), np.float32),
         _rows(where, "costly", read.costly_TD, (n, features.n_costly), costly_type(features)),
         _rows(where, "actions", read.actions_TA, (n, dataset.action.size), np.float32),
-        torch.from_numpy(returns_to_go(rewards.numpy())),
+        torch.from_numpy(togo_T),
+    )
+    _check_range(where, features.free, read.free_TF, features.free_range)
+    _check_range(where, features.costly, read.costly_TD, features.costly_range)
+    return steps
+
+
+def _check_range(
+    where: str, parts: Sequence[Feature], values_TX: NDArray[np.floating], limits: tuple[NDArray[np.float32], ...]
+) -> None:
+    """What a server would refuse a bot teaches none."""
+    as_sent_TX = values_TX.astype(np.float32)
+    outside_TX = (as_sent_TX < limits[0]) | (as_sent_TX > limits[1])
+    if not outside_TX.any():
+        return
+    t, x = (int(index) for index in np.argwhere(outside_TX)[0])
+    part = parts[int(np.repeat(np.arange(len(parts)), [one.size for one in parts])[x])]
+    raise TracesError(
+        f"{where}: {part.name} is {values_TX[t, x]:g} at timestep {t}, expected {part.low:g} to {part.high:g}, "
+        "its low and high in the feature map: a server refuses a bot's numbers outside"
     )
 
 

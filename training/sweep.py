@@ -27,6 +27,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from training.command import command
 from training.sweep_run import Run, launch
 from training.sweep_spec import SweepSpec
 
@@ -236,12 +237,8 @@ def _table(outcomes: list[Outcome]) -> Table:
 def main(arguments: list[str] | None = None) -> None:
     """Command line: a table of the runs; exit status 1 if one failed."""
     console = Console(width=None if sys.stdout.isatty() else _FILE_COLUMNS)
-    try:
+    with command("stopped: the same command goes on from here"):
         outcomes = sweep(tyro.cli(SweepConfig, args=arguments, description=__doc__), console)
-    except ValueError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("stopped: the same command goes on from here")
     console.print(_table(outcomes))
     failed = [outcome.run for outcome in outcomes if outcome.state == "failed"]
     for run in failed:

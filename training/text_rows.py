@@ -67,7 +67,9 @@ def json_rows(path: Path, columns: ColumnMap) -> Iterator[RowBatch]:
         try:
             row = _JSON.decode(text)
         except (msgspec.DecodeError, RecursionError) as error:
-            raise SourceError(f"{where}: holds {shown(text.strip())}, expected a JSON object: {error}") from error
+            hint = " (JSON knows no NaN and no Infinity)" if "NaN" in text or "Infinity" in text else ""
+            wrong = f"{where}: holds {shown(text.strip())}, expected a JSON object: {error}{hint}"
+            raise SourceError(wrong) from error
         try:
             return [row[name] for name in names]
         except KeyError as error:

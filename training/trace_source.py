@@ -28,7 +28,7 @@ class TraceSource(Protocol):
 
     @property
     def example(self) -> Steps:
-        """How one of the first episodes begins."""
+        """How the first of the longest episodes begins."""
 
     def __len__(self) -> int:
         """How many episodes there are."""

@@ -22,10 +22,9 @@ from training.feature_map import FeatureMap
 from training.statistics import Statistics, Tally
 from training.steps import Layout, Recordings, Steps
 
-__all__ = ["EXAMPLES", "Batch", "Traces", "Windows", "choose_example", "choose_windows", "load_traces", "read_windows"]
+__all__ = ["EXAMPLE_STEPS", "Batch", "Traces", "Windows", "choose_windows", "load_traces", "read_windows"]
 
-EXAMPLES = 8  # episodes looked at when one is chosen
-_EXAMPLE_STEPS = 128
+EXAMPLE_STEPS = 128  # most timesteps of the example
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,9 @@ class Traces:
 
     @cached_property
     def example(self) -> Steps:
-        """How one of the first episodes begins."""
-        return choose_example([self.episode(i) for i in range(min(EXAMPLES, len(self)))])
+        """How the first of the longest episodes begins."""
+        longest = int(np.minimum(self.lengths_E, EXAMPLE_STEPS).argmax())
+        return self.episode(longest).part(slice(0, EXAMPLE_STEPS))
 
     def episode(self, number: int) -> Steps:
         """One episode."""
@@ -126,12 +126,6 @@ class Batch:
     last_BT: Tensor  # 1 at an episode's last timestep
     valid_BT: Tensor
     weight_BT: Tensor  # how much each action counts
-
-
-def choose_example(episodes: list[Steps]) -> Steps:
-    """How the longest of the first few episodes begins; what comes after those few is not looked at."""
-    longest = max(episodes[:EXAMPLES], key=lambda steps: len(steps.returns_to_go_T))
-    return longest.part(slice(0, _EXAMPLE_STEPS))
 
 
 def load_traces(*paths: Path, episodes: int | None = None, feature_map: FeatureMap | None = None) -> Traces:

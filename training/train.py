@@ -25,6 +25,7 @@ from training.acquisition import Rollout, backward, rollout, sample_queries, sam
 from training.allocation import fit_bots, fit_frames
 from training.build import build_critics, build_model
 from training.checkpoint import Facts, load_checkpoint
+from training.command import command
 from training.config import TrainConfig
 from training.control import Control, Spent
 from training.draws import Drawn, draw, draw_share
@@ -34,7 +35,7 @@ from training.objectives import action_loss, query_cost
 from training.policy import BudgetedPolicy, Known
 from training.record import RunRecord, write_versions
 from training.trace_source import TraceSource, open_traces
-from training.traces import Traces
+from training.traces import EXAMPLE_STEPS, Traces
 
 __all__ = ["Pass", "TrainState", "know", "main", "new_state", "train", "update"]
 
@@ -59,6 +60,7 @@ class TrainState:
 
 def new_state(config: TrainConfig, traces: TraceSource) -> TrainState:
     """A run before its first update. Raises ValueError where settings and traces do not fit."""
+    _check_exportable(config, traces)
     torch.manual_seed(config.seed)
     model = build_model(config, traces)
     critics = build_critics(model)
@@ -71,6 +73,18 @@ def new_state(config: TrainConfig, traces: TraceSource) -> TrainState:
         state.critics, state.judge = critics, workers.spread(critics.to(config.device))
         state.critic_optimiser = torch.optim.Adam(critics.parameters(), lr=_CRITIC_RATE)
     return state
+
+
+def _check_exportable(config: TrainConfig, traces: TraceSource) -> None:
+    """What would only be noticed when the run is done. A bundle is verified by an episode that outlasts its memory."""
+    if not traces.layout.features.n_queries:
+        raise ValueError("no feature has a cost, expected one or more: there is nothing to decide on")
+    memory, n_steps = config.context_length if config.method == "bdt" else 1, len(traces.example.returns_to_go_T)
+    if n_steps <= memory:
+        raise ValueError(
+            f"the longest episode has {n_steps} timesteps (what lies beyond {EXAMPLE_STEPS} is not counted), expected "
+            f"more than {f'context_length {memory}' if memory > 1 else '1'}"
+        )
 
 
 def learning_rate(config: TrainConfig, done: int) -> float:
@@ -186,6 +200,8 @@ def _train(config: TrainConfig) -> TrainState:
         load_checkpoint(config.out / "checkpoint.pt", config, state)
     _check_together(config, state)
     training, held_out = traces.split(config.held_out)
+    if not len(training):
+        raise ValueError(f"held_out {config.held_out} of {len(traces)} episodes leaves none to train on")
     if config.keyframes is not None:
         training = _weigh(config.keyframes, training)
     training, held_out = training.to(config.device), _draw_held_out(config, held_out)
@@ -249,10 +265,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", type=Path)
     known, arguments = parser.parse_known_args(arguments)
-    default = None if known.config is None else TrainConfig.read(known.config)
-    config = tyro.cli(TrainConfig, default=default, args=arguments, description=__doc__)
-    with workers.joined(config.device):
-        train(config)
+    with command("stopped: the same command goes on from the last checkpoint"):
+        default = None if known.config is None else TrainConfig.read(known.config)
+        config = tyro.cli(TrainConfig, default=default, args=arguments, description=__doc__)
+        with workers.joined(config.device):
+            train(config)
 
 
 if __name__ == "__main__":

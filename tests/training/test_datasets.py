@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from pathlib import Path
 
 import gymnasium
 import minari
 import numpy as np
 import pytest
+from minari.data_collector.episode_buffer import EpisodeBuffer
+from rich.console import Console
 
 from tests.training.balance import CARTPOLE, write_cartpole
+from tests.training.logs import COLUMNS, rows, write_csv
 from training.config import TrainConfig
 from training.datasets import TracesError, observation_sizes, open_dataset
 from training.draft_map import DraftConfig, draft_map
@@ -19,6 +23,7 @@ from training.environments import open_environment
 from training.evaluate import EvaluateConfig, evaluate
 from training.export import ExportConfig, export
 from training.feature_map import FeatureMap, MappedFeature
+from training.import_traces import ImportConfig, import_traces
 from training.traces import load_traces
 from training.train import train
 
@@ -67,7 +72,7 @@ def test_a_dataset_that_tells_no_features_needs_a_map(cartpole: Path) -> None:
     ("key", "space", "message"),
     [
         ("action_space", {"type": "Discrete", "n": 3}, "there is no 'start'"),
-        ("observation_space", {"type": "Discrete", "n": 4}, "is a Discrete, expected a Box"),
+        ("observation_space", {"type": "Text"}, "is a Text, expected numbers or a Dict"),
         ("observation_space", [], r"found '\[\]', expected an object"),
         ("action_space", {"type": "MultiDiscrete", "nvec": [2, 2]}, "expected Discrete or a flat Box"),
         ("action_space", {"type": "Box", "shape": [1], "low": [float("-inf")], "high": [1.0]}, "expected finite"),
@@ -164,3 +169,101 @@ def test_a_draft_overwrites_nothing(cartpole: Path, tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text("mine")
     with pytest.raises(ValueError, match=r"map\.json exists"):
         DraftConfig(cartpole, tmp_path / "map.json")
+
+
+def test_an_observation_may_have_parts_that_are_no_boxes(tmp_path: Path) -> None:
+    """A mission in words and a nested Dict stand beside numbers of every kind; the map names numbers alone."""
+    spaces = gymnasium.spaces
+    observed = spaces.Dict(
+        {
+            "view": spaces.Box(-1.0, 1.0, (2, 2)),
+            "direction": spaces.Discrete(4),
+            "keys": spaces.MultiBinary(3),
+            "bag": spaces.MultiDiscrete([5, 7]),
+            "mission": spaces.Text(8),
+            "inner": spaces.Dict({"hidden": spaces.Box(-1.0, 1.0)}),
+        }
+    )
+    observed.seed(0)
+    seen = [observed.sample() for _ in range(4)]
+    buffer = EpisodeBuffer(
+        observations={
+            **{key: np.array([one[key] for one in seen]) for key in ("view", "direction", "keys", "bag")},
+            "mission": [one["mission"] for one in seen],
+            "inner": {"hidden": np.array([one["inner"]["hidden"] for one in seen])},
+        },
+        actions=np.zeros(3, np.int64),
+        rewards=[0.0, 1.0, 2.0],
+        terminations=[False, False, True],
+        truncations=[False] * 3,
+    )
+    with pytest.MonkeyPatch.context() as monkeypatch, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+        minari.create_dataset_from_buffers(
+            "parts/test-v0", [buffer], observation_space=observed, action_space=spaces.Discrete(2)
+        )
+    folder = tmp_path / "parts" / "test-v0"
+    assert observation_sizes(folder) == {"bag": 2, "direction": 1, "keys": 3, "view": 4}
+    chosen = FeatureMap(
+        (
+            MappedFeature("direction", key="direction"),
+            MappedFeature("bag", key="bag"),
+            MappedFeature("view", key="view"),
+        )
+    )
+    read = open_dataset(folder, chosen).episode(0)
+    np.testing.assert_array_equal(read.free_TF[:, 0], [one["direction"] for one in seen[:3]])
+    np.testing.assert_array_equal(read.free_TF[:, 1:3], [one["bag"] for one in seen[:3]])
+    np.testing.assert_array_equal(read.free_TF[:, 3:], [one["view"].ravel() for one in seen[:3]])
+    with pytest.raises(TracesError, match=r"has key 'mission', expected one of \['bag', 'direction', 'keys', 'view'\]"):
+        open_dataset(folder, FeatureMap((MappedFeature("mission", key="mission"),)))
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (
+            (MappedFeature("a", (0,), low=-0.01, high=0.01), MappedFeature("b", (1,), cost_us=1.0)),
+            "a is .* at timestep",
+        ),
+        (
+            (MappedFeature("a", (0,)), MappedFeature("b", (1, 2), cost_us=1.0, low=5.0, high=6.0)),
+            "b is .* expected 5 to 6",
+        ),
+    ],
+)
+def test_numbers_that_a_server_would_refuse_are_not_learned(
+    cartpole: Path, features: tuple[MappedFeature, ...], message: str
+) -> None:
+    with pytest.raises(TracesError, match=f"episode .*: {message}"):
+        load_traces(cartpole, feature_map=FeatureMap(features))
+
+
+def test_noise_keeps_within_the_range(cartpole: Path) -> None:
+    noisy = FeatureMap((MappedFeature("a", (0, 1, 2, 3), cost_us=1.0, noise=100.0, low=-3.1, high=3.1),))
+    costly_TD = open_dataset(cartpole, noisy).episode(0).costly_TD
+    assert np.abs(costly_TD).max() == np.float32(3.1)
+    assert load_traces(cartpole, feature_map=noisy).layout.features.n_costly == 4
+
+
+def test_a_draft_of_parts_has_names_that_training_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_csv(tmp_path / "log.csv", rows(3, 2))
+    columns = {**COLUMNS, "observations": {"Body": ["health"], "x2_Y": ["speed"]}}
+    del columns["observation"]
+    (tmp_path / "columns.json").write_text(json.dumps(columns))
+    out = tmp_path / "arena-v0"
+    import_traces(ImportConfig(tmp_path / "log.csv", out, tmp_path / "columns.json"), Console(quiet=True))
+    drafted = draft_map(DraftConfig(out, tmp_path / "map.json"))
+    assert [one.name for one in drafted.features] == ["body_0", "x2_y_0"]
+    assert load_traces(out, feature_map=drafted).layout.features.n_queries == 2
+    for wrong in ({"cost_us": -1.0}, {"names": ("a", "a")}, {"copies": ("low:5:0", "low:5:0")}):
+        with pytest.raises(ValueError, match=r"cost_us|unique"):
+            draft_map(DraftConfig(out, tmp_path / "map.json", **wrong))
+
+
+def test_a_map_without_costs_is_refused_before_training(cartpole: Path, tmp_path: Path) -> None:
+    FeatureMap((MappedFeature("all", (0, 1, 2, 3)),)).write(tmp_path / "map.json")
+    config = TrainConfig(cartpole, tmp_path / "run", "pole", feature_map=tmp_path / "map.json", bins=(2,))
+    with pytest.raises(ValueError, match="no feature has a cost"):
+        train(config)

@@ -10,6 +10,7 @@ from game.env import feature_table
 from tests.bundles import FEATURES
 from tests.training.line import LINE, TIME_LIMIT, TIMED_LINE
 from training.environments import Environment, Paying, _Whole, open_environment
+from training.feature_map import FeatureMap, MappedFeature
 
 NAVIGATION = "game.env:Navigation-hard-v0"
 
@@ -66,3 +67,33 @@ def test_both_offer_the_same_calls(name: str) -> None:
     for environment in (NAVIGATION, LINE):
         owner_D = feature_table().owner if environment == NAVIGATION else FEATURES.owner
         assert callable(getattr(open_environment(environment, owner_D), name))
+
+
+class Whole(gymnasium.Env):
+    """Takes whole numbers only, and shows the last ones."""
+
+    observation_space = gymnasium.spaces.Dict(
+        {"last": gymnasium.spaces.Box(-9.0, 9.0, (2,)), "word": gymnasium.spaces.Text(4)}
+    )
+    action_space = gymnasium.spaces.Box(-3, 3, (2,), np.int64)
+
+    def reset(self, *, seed: int | None = None, options: object = None) -> tuple[dict[str, object], dict[str, object]]:
+        return {"last": np.zeros(2), "word": "none"}, {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, object], float, bool, bool, dict[str, object]]:
+        assert self.action_space.contains(action)
+        return {"last": action.astype(np.float64), "word": "some"}, 0.0, False, False, {}
+
+
+def test_an_environment_of_whole_numbers_gets_whole_numbers() -> None:
+    gymnasium.register("Whole-v0", lambda: Whole(), disable_env_checker=True)
+    env = open_environment("Whole-v0", np.zeros(2, dtype=np.int64), FeatureMap((MappedFeature("last", key="last"),)))
+    env.restart(0)
+    env.advance(np.array([1.6, -2.2], dtype=np.float32))
+    assert env.free().tolist() == [2.0, -2.0]
+
+
+@pytest.mark.parametrize("name", ["Nope-v0", "no_such_module:Nope-v0", "not an id"])
+def test_an_environment_that_cannot_be_made_is_named(name: str) -> None:
+    with pytest.raises(ValueError, match=f"environment {name}: "):
+        open_environment(name, FEATURES.owner)

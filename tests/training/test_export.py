@@ -149,3 +149,15 @@ def test_a_served_bot_follows_the_budget_that_the_engine_gives_in_each_frame(dat
     for frame, share in enumerate((0.1, 0.7, 0.3)):
         asked = bots.request_queries(handles, frame, np.zeros((1, 2), np.float32), target_costs_us=[share * full])
         assert asked.probs_NM == pytest.approx(share, abs=1e-6)
+
+
+def test_only_a_bundle_or_nothing_is_replaced(trained: tuple[Path, TrainState], tmp_path: Path) -> None:
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    (notes / "mine.txt").write_text("kept")
+    with pytest.raises(ValueError, match="is there and is no bundle"):
+        export(ExportConfig(trained[0], notes))
+    assert (notes / "mine.txt").read_text() == "kept"
+    (notes / "mine.txt").unlink()
+    for _ in range(2):  # into an empty folder, then in place of what came of that
+        assert export(ExportConfig(trained[0], notes)).manifest.name == "toy"

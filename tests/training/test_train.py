@@ -256,3 +256,30 @@ def test_command_line_overrides_its_configuration_file(
     with pytest.raises(SystemExit):
         main(["--config"])
     assert "expected one argument" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"context_length": 29, "window": 40},
+            r"has 29 timesteps .* expected more than context_length 29",
+        ),
+        ({"held_out": 0.99}, "held_out 0.99 of 40 episodes leaves none to train on"),
+    ],
+)
+def test_what_would_end_without_a_bundle_does_not_begin(
+    dataset: Path, tmp_path: Path, settings: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        train(toy.config(dataset, tmp_path / "run", **settings))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_late_long_episode_is_enough_for_a_bundle(dataset: Path) -> None:
+    traces = load_traces(dataset)
+    longest = int(traces.lengths_E.argmax())
+    assert longest >= 8
+    example = traces.example
+    assert len(example.returns_to_go_T) == traces.lengths_E[longest]
+    assert torch.equal(example.free_TF, traces.episode(longest).free_TF)
