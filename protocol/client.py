@@ -6,6 +6,7 @@ package, plain dicts and numpy, on purpose not with `protocol.codec`. Shape lett
 
 from __future__ import annotations
 
+import operator
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -140,7 +141,7 @@ class BotClient:
         so in `reasons`. Raises BadShape locally too.
         """
         table, handles = self.welcome.features, handles_of(bots)
-        message = {"type": "request_queries", "frame": int(frame), "bots": handles}
+        message = {"type": "request_queries", "frame": operator.index(frame), "bots": handles}
         message["free"] = matrix(free, FLOAT, (len(handles), table.n_free), "free").tobytes()
         add_numbers(message, "rewards", rewards)
         add_number(message, "frame_budget_us", frame_budget_us)
@@ -169,7 +170,7 @@ class BotClient:
         safe one. Raises BadShape locally too.
         """
         welcome, handles = self.welcome, handles_of(bots)
-        message = {"type": "submit_features", "frame": int(frame), "bots": handles}
+        message = {"type": "submit_features", "frame": operator.index(frame), "bots": handles}
         add_acquired(message, welcome.features, len(handles), acquired, costly, failed)
         add_number(message, "acquire_us", acquire_us)
         add_number(message, "deadline_us", deadline_us)
@@ -200,7 +201,7 @@ class BotClient:
         Raises OverBudget where what was acquired or failed costs more than a budget; BadShape locally too.
         """
         welcome, handles = self.welcome, handles_of(bots)
-        table, message = welcome.features, {"type": "take_turn", "frame": int(frame), "bots": handles}
+        table, message = welcome.features, {"type": "take_turn", "frame": operator.index(frame), "bots": handles}
         message["free"] = matrix(free, FLOAT, (len(handles), table.n_free), "free").tobytes()
         add_acquired(message, table, len(handles), acquired, costly, failed)
         add_numbers(message, "rewards", rewards)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from protocol.errors import NoBot
+from protocol.packing import handles_of
 
 __all__ = ["Names"]
 
@@ -30,8 +31,8 @@ class Names:
         return numbers
 
     def known(self, bots: ArrayLike) -> list[int]:
-        """These numbers. Raises NoBot where there is no such bot."""
-        numbers: list[int] = np.atleast_1d(np.asarray(bots, dtype=np.int64)).tolist()
+        """These numbers. Raises NoBot where there is no such bot, BadSchema for floats."""
+        numbers = handles_of(bots)
         for number in numbers:
             if number not in self.now:
                 raise NoBot(f"no bot {number} of this client")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from protocol.errors import BadShape
+from protocol.errors import BadSchema, BadShape
 from protocol.features import CostModel, FeatureTable
 
 __all__ = ["FLOAT", "add_acquired", "add_number", "add_numbers", "cost_model_dict", "handles_of", "matrix"]
@@ -24,8 +24,11 @@ def cost_model_dict(cost_model: CostModel) -> dict[str, Any]:
 
 
 def handles_of(bots: ArrayLike) -> list[int]:
-    """One handle or many, as a list."""
-    handles: list[int] = np.array(bots, dtype=np.int64, ndmin=1).tolist()
+    """One handle or many, as a list. Raises BadSchema for floats, which round a handle to that of another bot."""
+    array = np.array(bots, ndmin=1)
+    if array.size and array.dtype.kind not in "iu":
+        raise BadSchema(f"bots are {array.dtype}, expected whole numbers as `start` gave them")
+    handles: list[int] = array.tolist()
     return handles
 
 

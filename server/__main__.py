@@ -39,7 +39,7 @@ async def _serve(settings: Settings) -> None:
                 _write(settings.ready_file, {**addresses, "pid": os.getpid()})
             await stop.wait()
         finally:
-            if settings.ready_file is not None:
+            if settings.ready_file is not None and _is_ours(settings.ready_file):
                 settings.ready_file.unlink(missing_ok=True)
         _log.info("draining")
 
@@ -51,15 +51,24 @@ def _write(path: Path, content: dict[str, str | int]) -> None:
     unfinished.replace(path)
 
 
+def _is_ours(path: Path) -> bool:
+    """Whether no other server has written its own there since."""
+    try:
+        return bool(json.loads(path.read_bytes())["pid"] == os.getpid())
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
+
+
 def main() -> None:
     """Parse the command line and serve. Exits with 2 for settings or a bundle that cannot be served."""
-    with Aside(sys.stderr.fileno()) as stream:
+    descriptor = os.open(os.devnull, os.O_WRONLY) if sys.stderr is None else sys.stderr.fileno()
+    with Aside(descriptor) as stream:
         configure(None, stream)
         try:
             settings = tyro.cli(Settings, description="Serve bundles to game engines.")
             configure(settings.log_json, stream)
             uvloop.run(_serve(settings))
-        except (ValueError, BadBundle, OSError) as error:
+        except (ValueError, OverflowError, BadBundle, OSError) as error:
             _log.error(str(error))
             sys.exit(2)
 

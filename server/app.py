@@ -208,12 +208,12 @@ async def _streams(settings: Settings, sockets: Sockets) -> AsyncIterator[dict[s
             addresses["unix"] = f"unix://{settings.uds.absolute()}"
         yield addresses
     finally:
+        if settings.uds is not None and "unix" in addresses:
+            settings.uds.unlink(missing_ok=True)  # while it is ours: once it is closed a successor may take its place
         for acceptor in acceptors:
             acceptor.close()
             await acceptor.wait_closed()
         await sockets.drain(settings.drain_s)
-        if settings.uds is not None and "unix" in addresses:
-            settings.uds.unlink(missing_ok=True)
 
 
 @asynccontextmanager

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import queue
+import select
 import threading
 from types import TracebackType
 
@@ -30,7 +31,8 @@ class Aside:
     def __init__(self, descriptor: int, limit: int = 1000) -> None:
         self._descriptor = descriptor
         self._lines: queue.Queue[str | None] = queue.Queue(limit)
-        self._n_lost = 0
+        self._n_lost = self._n_unwritten = 0  # for want of room; for an error of the descriptor's
+        self._torn = False  # whether the last line ended in its middle
         self._writer = threading.Thread(target=self._write_on, name="log", daemon=True)
         self._writer.start()
 
@@ -60,12 +62,23 @@ class Aside:
     def _write_on(self) -> None:
         said = 0
         while (line := self._lines.get()) is not None:
-            try:
-                rest = line.encode(errors="backslashreplace")
-                while rest:
-                    rest = rest[os.write(self._descriptor, rest) :]
-            except OSError:  # whoever read is gone for good: there is nobody to tell
-                continue
-            if (lost := self._n_lost) > said:
+            if not self._written(line):
+                self._n_unwritten += 1
+            elif (lost := self._n_lost + self._n_unwritten) > said:
                 _log.warning("log lines lost", lines=lost - said)
                 said = lost
+
+    def _written(self, line: str) -> bool:
+        """Whether the whole line is. A disk may be full for a while, a reader gone for good."""
+        rest = (b"\n" if self._torn else b"") + line.encode(errors="backslashreplace")
+        size = len(rest)
+        while rest:
+            try:
+                rest = rest[os.write(self._descriptor, rest) :]
+            except BlockingIOError:  # whose descriptor it is too has made it so
+                select.select([], [self._descriptor], [])
+            except OSError:
+                self._torn = self._torn or len(rest) < size
+                return False
+        self._torn = False
+        return True

@@ -16,6 +16,7 @@ from server.tokens import MIN_CHARS, read_token
 
 __all__ = ["Settings"]
 
+_MAX_S = 1e6  # eleven days; timers of the loop know no infinity
 _PROCESS = re.compile(r"[a-z0-9]{1,16}")
 
 
@@ -99,8 +100,12 @@ class Settings:
             raise ValueError("give either a bundle or a store")
         if min(self.max_bots, self.max_connections, self.max_queue, self.max_loaded, self.http_sockets) < 1:
             raise ValueError("max_bots, max_connections, max_http_sockets, max_queue and max_loaded must be at least 1")
-        if min(self.idle_ttl_s, self.frame_deadline_s, self.stuck_after_s, self.drain_s) <= 0:
-            raise ValueError("idle_ttl_s, frame_deadline_s, stuck_after_s and drain_s must be positive")
+        for name in ("idle_ttl_s", "frame_deadline_s", "stuck_after_s", "drain_s"):
+            if not 0.0 < getattr(self, name) <= _MAX_S:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected above 0 and at most {_MAX_S:g}")
+        for name in ("port", "tcp_port"):
+            if not 0 <= (getattr(self, name) or 0) <= 65535:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 0 to 65535")
         if self.otlp_endpoint is not None and not self.otlp_endpoint.startswith(("http://", "https://")):
             raise ValueError(f"otlp_endpoint is {self.otlp_endpoint[:200]!r}, expected a URL")
         if not self.otlp_every_s >= 0.01:

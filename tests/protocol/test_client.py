@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.client import BotClient, ReplyError
-from protocol.errors import BadShape, InternalError, NoConnection, ProtocolError
+from protocol.errors import BadSchema, BadShape, InternalError, NoConnection, ProtocolError
 from protocol.replies import read_actions, read_queries, read_reply, read_welcome
 from tests.protocol.golden import BOTS, REPLIES, TABLE, VECTORS, WELCOME
 
@@ -91,6 +91,19 @@ def test_arrays_of_another_shape_are_refused_before_they_are_sent() -> None:
         ):
             with pytest.raises(BadShape):
                 request()
+        client._transport.close()
+    assert heard == [VECTORS["hello"].frame]
+
+
+def test_handles_that_became_floats_are_refused_before_they_reach_another_bot() -> None:
+    """`np.append` of an empty array makes them floats, and rounds them."""
+    with scripted([VECTORS["welcome"].frame]) as (port, heard):
+        client = BotClient(f"tcp://127.0.0.1:{port}")
+        client.hello()
+        with pytest.raises(BadSchema, match="bots are float64, expected whole numbers"):
+            client.query(np.append(np.array([]), BOTS), 0, FREE)
+        with pytest.raises(TypeError):
+            client.query(BOTS, 0.5, FREE)  # type: ignore[arg-type]
         client._transport.close()
     assert heard == [VECTORS["hello"].frame]
 

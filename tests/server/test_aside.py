@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Iterator
 from io import FileIO
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from server.aside import Aside
+from tests.training.test_sink import most_bytes_of_a_file
 
 
 @pytest.fixture
@@ -77,3 +79,33 @@ def test_a_reader_that_has_gone_costs_the_lines_only(pipe: tuple[FileIO, FileIO]
         for i in range(10):
             aside.write(f"{i}\n")
     assert not aside._writer.is_alive()
+
+
+def test_a_pipe_that_does_not_block_is_waited_for(pipe: tuple[FileIO, FileIO]) -> None:
+    reader, writer = pipe
+    stuffed = fill(writer)
+    os.set_blocking(writer.fileno(), False)
+    with Aside(writer.fileno()) as aside:
+        for i in range(100):
+            aside.write(f"{i} {'x' * 5000}\n")
+        got: list[bytes] = []
+        thread = threading.Thread(target=lambda: got.append(reader.readall()))
+        thread.start()
+        while not aside._lines.empty():
+            time.sleep(0.001)
+    writer.close()
+    thread.join()
+    assert [int(line.split()[0]) for line in got[0][stuffed:].splitlines()] == list(range(100))
+
+
+def test_a_disk_that_was_full_costs_lines_that_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with (tmp_path / "log").open("wb") as file, most_bytes_of_a_file(250), Aside(file.fileno()) as aside:
+        for i in range(10):
+            aside.write(f"{i} {'x' * 97}\n")
+        while not aside._lines.empty():
+            time.sleep(0.001)
+        file.truncate(0)  # somebody makes room
+        os.lseek(file.fileno(), 0, os.SEEK_SET)
+        aside.write("after\n")
+    assert "after" in (tmp_path / "log").read_text().splitlines()
+    assert sum(record.lines for record in caplog.records if record.message == "log lines lost") == 8

@@ -111,3 +111,31 @@ def test_what_cannot_be_served_ends_with_2_and_says_why(bundle: Path, arguments:
     assert ended.returncode == 2
     assert "Traceback" not in ended.stderr
     assert said in ended.stderr
+
+
+def test_a_door_in_use_is_not_taken_and_a_successors_is_left_alone(bundle: Path, tmp_path: Path) -> None:
+    with process(bundle, tmp_path) as (first, addresses):
+        command = [sys.executable, "-m", "server", "--bundle", str(bundle), "--port", "0", "--uds", str(tmp_path / "s")]
+        second = subprocess.run(command, capture_output=True, text=True, timeout=START_S)
+        assert second.returncode == 2
+        assert "a server listens on" in second.stderr
+        with BotClient(addresses["unix"]) as client:
+            client.hello()
+        ready = tmp_path / "ready.json"
+        ready.write_text(json.dumps(json.loads(ready.read_text()) | {"pid": 1}))  # a successor's
+        first.terminate()
+        assert first.wait(timeout=20) == 0
+        assert os.listdir(tmp_path) == ["ready.json"]
+
+
+def test_a_closed_standard_error_stops_no_server(bundle: Path, tmp_path: Path) -> None:
+    ready = tmp_path / "ready.json"
+    command = f"exec {sys.executable} -m server --bundle {bundle} --port 0 --ready-file {ready} 2>&-"
+    with subprocess.Popen(["bash", "-c", command]) as server:
+        give_up = time.monotonic() + START_S
+        while not ready.exists():
+            assert server.poll() is None
+            assert time.monotonic() < give_up
+            time.sleep(0.01)
+        server.terminate()
+        assert server.wait(timeout=20) == 0
