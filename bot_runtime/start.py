@@ -17,7 +17,7 @@ from bot_runtime.manifest import Manifest
 from bot_runtime.request import Numbers
 from bot_runtime.spending import Limits, Spending
 from protocol.features import CostModel
-from protocol.messages import MAX_RETURN
+from protocol.messages import MAX_RETURN, MAX_RETURN_TO_GO
 
 __all__ = ["Start"]
 
@@ -49,7 +49,8 @@ class Start(NamedTuple):
         inputs.check_costs(model, manifest.features)
         returns_N = np.full(count, manifest.target_return)
         if target_returns is not None:
-            returns_N = inputs.per_bot("target_returns", target_returns, count, -MAX_RETURN, MAX_RETURN)
+            most = MAX_RETURN if turns is None else MAX_RETURN_TO_GO  # a resumed bot's rewards have been counted
+            returns_N = inputs.per_bot("target_returns", target_returns, count, -most, most)
         limits = Limits.checked(count, budgets_us, target_costs_us)
         turns_N = None if turns is None else inputs.turns(turns, count)
         return cls(inputs.seeds(seeds, count), returns_N, turns_N, limits, model)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from protocol.answered import Answered, Answers
 from protocol.client import BotClient
-from protocol.errors import NoBot, NoConnection
+from protocol.errors import NoBot, NoBundle, NoConnection
 from protocol.features import CostModel
 from protocol.history import History
 from protocol.names import Names
@@ -258,7 +258,10 @@ class ResumingClient:
         was = self.welcome
         if was.bundle_version is not None:
             said = {**said, "bundle": f"{was.bundle}@{was.bundle_version}"}
-        welcome = self._client.hello(**said)
+        try:
+            welcome = self._client.hello(**said)
+        except NoBundle as error:  # another version was activated, and this line was the last to hold the old one
+            raise NoBot("another version is served now: the bots cannot be resumed") from error
         if welcome.bundle_sha256 != was.bundle_sha256 or welcome.features != was.features:
             raise NoBot("another bundle is served now: the bots cannot be resumed")
         self._names.now = rebuild(self._client, self._history)

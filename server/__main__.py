@@ -16,7 +16,7 @@ from pathlib import Path
 import tyro
 import uvloop
 
-from protocol.errors import BadBundle
+from protocol.errors import ProtocolError
 from server.app import running
 from server.aside import Aside
 from server.logs import configure, logger
@@ -68,7 +68,7 @@ def main() -> None:
             settings = tyro.cli(Settings, description="Serve bundles to game engines.")
             configure(settings.log_json, stream)
             uvloop.run(_serve(settings))
-        except (ValueError, OverflowError, BadBundle, OSError) as error:
+        except (ValueError, OverflowError, MemoryError, ProtocolError, OSError) as error:
             _log.error(str(error))
             sys.exit(2)
 

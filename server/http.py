@@ -91,7 +91,8 @@ class HttpDoor:
 
 def create_app(door: HttpDoor, probes: Probes) -> FastAPI:
     """The application: probes, and documentation at /docs of these and of the message routes."""
-    app = FastAPI(title="Budgeted bot runtime", version=str(messages.PROTOCOL_VERSION), redoc_url=None)
+    version = str(messages.PROTOCOL_VERSION)
+    app = FastAPI(title="Budgeted bot runtime", version=version, redoc_url=None, redirect_slashes=False)
     views = {"/v1/bundle": door.bundle, "/v1/costs": door.costs}
     views |= dict(zip(HEAD_ROUTES, (door.manifest, door.acquisition), strict=True))
     views |= {"/healthz": probes.healthz, "/readyz": probes.readyz, "/metrics": probes.metrics}

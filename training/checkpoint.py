@@ -5,9 +5,10 @@ Tensors and plain values only, read with `weights_only=True`: a checkpoint canno
 
 from __future__ import annotations
 
-import os
+import io
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -18,6 +19,8 @@ from training.build import make_policy
 from training.config import TrainConfig
 from training.feature_map import FeatureMap
 from training.policy import BudgetedPolicy, ModelConfig
+from training.replace_file import replace_file
+from training.steps import Layout
 from training.trace_source import TraceSource
 
 if TYPE_CHECKING:
@@ -80,24 +83,28 @@ def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainS
     }
     if state.critics is not None and state.critic_optimiser is not None:
         data |= {"critics": state.critics.state_dict(), "critic_optimiser": state.critic_optimiser.state_dict()}
-    partial = path.with_suffix(".partial")
-    torch.save(data, partial)
-    os.replace(partial, path)
+    content = io.BytesIO()  # torch itself says nothing of a disk that is full
+    torch.save(data, content)
+    replace_file(path, content.getvalue())
 
 
-def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
+def load_checkpoint(path: Path, config: TrainConfig, state: TrainState, layout: Layout) -> None:
     """Continue a run: its settings must be those it began with, but for how long it goes on. Raises ValueError."""
-    data = torch.load(path, weights_only=True, map_location="cpu")
+    data = _read(path)
+    state.done, state.seconds = data["done"], data["seconds"]
     theirs, ours = _decode_config(data["config"]), config
     for name, value in asdict(ours).items():
         if name not in ("out", "updates", "log_every", "checkpoint_every") and getattr(theirs, name) != value:
             raise ValueError(
                 f"{path} was trained with {name} {getattr(theirs, name)}, this run has {value}: use another out"
             )
+    if state.done > config.updates:
+        raise ValueError(f"{path} is of update {state.done}, expected at most updates {config.updates}")
+    if _layout(data) != (layout.features, layout.action, layout.feature_map):
+        raise ValueError(f"{path} was trained with other features, costs or actions than the traces have now")
     state.model.load_state_dict(data["model"])
     state.optimiser.load_state_dict(data["optimiser"])
     state.control.weights = list(data["penalty_weights"])
-    state.done, state.seconds = data["done"], data["seconds"]
     if state.critics is not None and state.critic_optimiser is not None:
         state.critics.load_state_dict(data["critics"])
         state.critic_optimiser.load_state_dict(data["critic_optimiser"])
@@ -109,19 +116,33 @@ def load_trained(path: Path) -> Trained:
         raise FileNotFoundError(
             f"{path} does not exist: training writes it every checkpoint_every updates, and at the end"
         )
-    data = torch.load(path, weights_only=True, map_location="cpu")
+    data = _read(path)
     model = make_policy(msgspec.json.decode(data["model_config"], type=ModelConfig))
     model.load_state_dict(data["model"])
     model.eval()
-    facts = Facts(
+    features, action, feature_map = _layout(data)
+    facts = Facts(features, action, data["target_return"], data["golden"], feature_map)
+    return Trained(_decode_config(data["config"]), facts, model, data["done"])
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Raises ValueError for what is no checkpoint or not a whole one."""
+    try:
+        data = torch.load(path, weights_only=True, map_location="cpu")
+    except (EOFError, KeyError, OSError, RuntimeError, UnpicklingError) as error:
+        raise ValueError(f"{path} is no whole checkpoint") from error
+    if not isinstance(data, dict) or "config" not in data:
+        raise ValueError(f"{path} is no checkpoint of a run")
+    return data
+
+
+def _layout(data: dict[str, Any]) -> tuple[FeatureTable, ActionSpec, FeatureMap | None]:
+    return (
         msgspec.json.decode(data["features"], type=FeatureTable),
         msgspec.json.decode(data["action"], type=ActionSpec),
-        data["target_return"],
-        data["golden"],
         # Runs from before feature maps have none.
         msgspec.json.decode(data.get("feature_map", "null"), type=FeatureMap | None),
     )
-    return Trained(_decode_config(data["config"]), facts, model, data["done"])
 
 
 def _decode_config(text: str) -> TrainConfig:

@@ -11,11 +11,15 @@ from typing import Literal
 
 import msgspec
 
+from protocol.messages import MAX_RETURN
+from training.replace_file import replace_file
+
 __all__ = ["DATASET_NAME", "TrainConfig"]
 
 
 DATASET_NAME = re.compile(r"(?P<map>[a-z0-9]+)-(?P<quality>[a-z0-9-]+)-v\d+")  # such as hard-expert-v0
 _COUNTS = ("window", "width", "n_layers", "n_heads", "encoder_width", "batch", "updates", "warmup", "sweeps")
+_MOST = 1e3  # of what is multiplied into every update
 _COUNTS += ("frame_bots", "log_every", "checkpoint_every")
 
 
@@ -83,6 +87,17 @@ class TrainConfig:
         for name in ("budget", "frame_budget", "held_out", "beginnings"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
+        for name in ("learning_rate", "gradient_clip", "penalty_step"):
+            if not 0.0 < getattr(self, name) <= _MOST:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected above 0 and at most {_MOST:g}")
+        if not 0 <= self.seed < 2**63:
+            raise ValueError(f"seed is {self.seed}, expected 0 or more")
+        for name in ("acquisition_bias", "weight_decay"):
+            if not abs(getattr(self, name)) <= _MOST:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected at most {_MOST:g} either way")
+        for told in (self.target_return, *(self.reference_returns or ())):
+            if told is not None and not abs(told) <= MAX_RETURN:
+                raise ValueError(f"a return is {told}, expected at most {MAX_RETURN:g} either way")
         for name in _COUNTS:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 1 or more")
@@ -148,4 +163,4 @@ class TrainConfig:
 
     def write(self, path: Path) -> None:
         """Write every setting as JSON."""
-        path.write_bytes(msgspec.json.format(msgspec.json.encode(asdict(self), enc_hook=str), indent=2) + b"\n")
+        replace_file(path, msgspec.json.format(msgspec.json.encode(asdict(self), enc_hook=str), indent=2) + b"\n")

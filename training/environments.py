@@ -134,7 +134,7 @@ class _Mapped(_Whole):
         self._whole = env.action_space.dtype if np.issubdtype(env.action_space.dtype, np.integer) else None
 
     def restart(self, seed: int) -> None:
-        self._chance = np.random.default_rng(seed)  # of the noise, before the first observation
+        self._chance = np.random.default_rng([seed, 1])  # of the noise: [seed] alone is the environment's own chance
         super().restart(seed)
 
     def _split(self, observation: Any) -> dict[str, _Floats]:

@@ -7,26 +7,23 @@ never sees. This module knows nothing about torch.
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.progress import Progress
 
 from bot_runtime.bundle import Bundle
 from bot_runtime.manifest import Manifest
 from protocol.messages import MAX_RETURN
-from training.command import command
+from training.command import command, terminable
 from training.feature_map import FEATURE_MAP, FeatureMap
 from training.heat_map import HeatSums
-from training.play import Episode, Group, Player, Terms
+from training.play import Episode, Group, Terms
+from training.players import play_groups
 
 __all__ = ["Episode", "EvaluateConfig", "Evaluation", "evaluate", "write_evaluation"]
 
@@ -47,7 +44,7 @@ class EvaluateConfig:
     frame_budget: float | None = None  # hard cap that all bots alive in a frame share, of their full cost (None: none)
     bots: int = 32  # most bots at once, as one batch
     workers: int = os.cpu_count() or 1
-    out: Path | None = None  # where evaluation.json goes (None: into the bundle's folder)
+    out: Path | None = None  # where evaluation.json goes (None: into the bundle's folder, unless it has one)
     heat_map: Path | None = None  # where the acquisition heat map goes (None: nowhere)
 
     def __post_init__(self) -> None:
@@ -100,7 +97,7 @@ def evaluate(config: EvaluateConfig) -> tuple[Evaluation, list[Episode]]:
     """
     bundle = Bundle.load(config.bundle)
     terms = _terms(config, bundle.manifest)
-    groups = _play_all(config, terms, bundle.name)
+    groups = play_groups(terms, _groups(config), config.workers, bundle.name)
     episodes = sorted((episode for group in groups for episode in group.episodes), key=lambda episode: episode.seed)
     if config.heat_map is not None:
         _write_heat_map(config.heat_map, groups, bundle.manifest)
@@ -137,35 +134,11 @@ def _terms(config: EvaluateConfig, manifest: Manifest) -> Terms:
     )
 
 
-_player: Player | None = None
-
-
-def _start_worker(terms: Terms) -> None:
-    global _player
-    _player = Player(terms)
-
-
-def _play(seeds: list[int]) -> Group:
-    if _player is None:
-        raise RuntimeError("a worker plays only after it was started")
-    return _player.play(seeds)
-
-
-def _play_all(config: EvaluateConfig, terms: Terms, name: str) -> list[Group]:
-    """Every group, in order. Who plays with whom follows from `episodes` and `bots` alone."""
+def _groups(config: EvaluateConfig) -> list[list[int]]:
+    """Seeds that play together. Who plays with whom follows from `episodes` and `bots` alone."""
     seeds = np.arange(config.seed, config.seed + config.episodes)
     n_groups = math.ceil(config.episodes / (_EPISODES_A_BOT * config.bots))
-    parts: list[list[int]] = [part.tolist() for part in np.array_split(seeds, n_groups)]
-    context = multiprocessing.get_context("spawn")
-    with (
-        ProcessPoolExecutor(min(config.workers, n_groups), context, _start_worker, (terms,)) as pool,
-        Progress(console=Console(file=sys.stderr)) as progress,
-    ):
-        task = progress.add_task(f"evaluating {name}", total=config.episodes)
-        futures = [pool.submit(_play, part) for part in parts]
-        for done in as_completed(futures):
-            progress.advance(task, len(done.result().episodes))
-        return [future.result() for future in futures]
+    return [part.tolist() for part in np.array_split(seeds, n_groups)]
 
 
 def _summary(
@@ -237,15 +210,19 @@ def _write_heat_map(path: Path, groups: list[Group], manifest: Manifest) -> None
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line: prints one JSON line, and writes it with every episode."""
-    with command():
+    """Command line: prints one JSON line, and writes it with every episode; no record of before is replaced unasked."""
+    with command(), terminable():
         config = tyro.cli(EvaluateConfig, args=arguments, description=__doc__)
         for path in (config.out, config.heat_map):
-            if path is not None and not path.parent.is_dir():
-                raise ValueError(f"{path.parent} is not a folder, expected the one that {path.name} goes into")
+            if path is not None and (path.is_dir() or not path.parent.is_dir()):
+                raise ValueError(f"{path} is a folder or in none, expected a file's place")
         evaluation, episodes = evaluate(config)
         print(msgspec.json.encode(asdict(evaluation)).decode(), flush=True)
-        write_evaluation(config.out or config.bundle / "evaluation.json", evaluation, episodes)
+        record = config.bundle / "evaluation.json"
+        if config.out is not None or not record.exists():
+            write_evaluation(config.out or record, evaluation, episodes)
+        else:
+            print(f"{record} stays as it is: --out writes elsewhere", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib.metadata
 import json
 import platform
@@ -16,6 +17,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from training.checkpoint import Facts, save_checkpoint
 from training.config import TrainConfig
+from training.replace_file import replace_file
 from training.statistics import Statistics
 
 if TYPE_CHECKING:
@@ -37,10 +39,17 @@ class RunRecord:
         self._counts: dict[str, int] = {}  # updates in each sum: a stratum is not in every batch
         self._began = time.monotonic() - state.seconds
         metrics = config.out / "metrics.jsonl"
-        if metrics.exists():  # lines that came after the checkpoint will come again
-            kept = [line for line in metrics.read_text().splitlines(True) if json.loads(line)["update"] <= state.done]
-            metrics.write_text("".join(kept))
-        self._lines = metrics.open("a")
+        self._lines = metrics.open("a+")
+        try:
+            fcntl.flock(self._lines, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self._lines.close()
+            raise ValueError(f"{config.out} is being trained by another process") from error
+        self._lines.seek(0)
+        whole = [line for line in self._lines if line.endswith("\n")]  # but for one that a kill or a full disk cut
+        kept = [line for line in whole if json.loads(line)["update"] <= state.done]  # the others will come again
+        self._lines.truncate(0)
+        self._lines.write("".join(kept))
         self._board = SummaryWriter(str(config.out), purge_step=state.done + 1)
         columns = (*Progress.get_default_columns()[:2], TimeElapsedColumn(), TimeRemainingColumn())
         self._progress = Progress(*columns, TextColumn("{task.fields[now]}"))
@@ -92,4 +101,4 @@ def write_versions(path: Path, statistics: Statistics, workers: int) -> None:
         "episodes": str(statistics.n_episodes),
         "steps": str(statistics.n_steps),
     }
-    path.write_text(json.dumps(versions, indent=2) + "\n")
+    replace_file(path, (json.dumps(versions, indent=2) + "\n").encode())

@@ -71,7 +71,8 @@ class Moments:
         thousand steps must not enter the network thirty times too large."""
         deviation = (self._squares / self._count).sqrt()
         largest = torch.maximum(self._high - self._mean, self._mean - self._low)
-        scale = torch.maximum(deviation, 0.1 * largest).clamp(min=1e-6)
+        scale = torch.maximum(deviation, 0.1 * largest)
+        scale = torch.where(scale > 1e-6, scale, 1.0)  # what never varied may do so at play
         return Spread(*(tuple(part.float().tolist()) for part in (self._mean, scale)))
 
 

@@ -69,8 +69,8 @@ class Run:
         try:
             last = (self.config.out / "metrics.jsonl").read_bytes().rsplit(b"\n", 2)[-2]
             return int(msgspec.json.decode(last)["update"])
-        except (FileNotFoundError, IndexError):
-            return 0
+        except (OSError, IndexError, KeyError, ValueError, msgspec.DecodeError):
+            return 0  # only shown, and never a reason to stop other runs
 
     def state(self) -> Literal["new", "begun", "done"]:
         """How far the folder is. Raises ValueError where it was made with other settings."""

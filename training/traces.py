@@ -143,8 +143,11 @@ def load_traces(*paths: Path, episodes: int | None = None, feature_map: FeatureM
 def choose_windows(
     traces: Traces, batch: int, length: int, generator: np.random.Generator, beginnings: float = 0.0
 ) -> Windows:
-    """Windows [B, T]: an episode in proportion to its length, then a start that lets its first timesteps be seen as
-    often as the others, but for the share `beginnings` of the windows, which start where their episode does."""
+    """Windows [B, T]: an episode in proportion to its length, then a start that may be cut by either end, but for the
+    share `beginnings` of the windows, which start where their episode does.
+
+    The first and last timesteps are seen half as often as those in the middle, those a window away half as often again;
+    without the starts that are cut the first would be met once an episode."""
     share = traces.lengths_E / traces.lengths_E.sum()
     episode_B = generator.choice(len(share), size=batch, p=share)
     length_B = traces.lengths_E[episode_B]

@@ -140,7 +140,9 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tens
     penalised = control.penalty(cost_BT, drawn.target_B, drawn.stratum_B, valid_BT) * valid_BT.sum() / counted_BT.sum()
     loss = workers.weigh(counted_BT, whole.counted_BT) * (action_loss(losses_BT, counted_BT) + penalised)
     backward(sampled, loss, config.sweeps if model.config.has_memory else 1, list(model.parameters()))
-    norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
+    norm = float(torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip))
+    if not math.isfinite(norm):  # what follows would replace the last good checkpoint by one without a number in it
+        raise ValueError(f"update {state.done + 1} has no finite gradient: try a lower learning_rate")
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, state.done)
     state.optimiser.step()
@@ -150,7 +152,7 @@ def update(config: TrainConfig, state: TrainState, traces: Traces, costs_M: Tens
         control.observe(*spent)
     state.done += 1
     delta, n_strata = action_loss(losses_BT, whole.counted_BT).item(), max(len(config.budgets) - 1, 0)
-    state.metrics = {"delta": delta, **spent.means(n_strata), "passes": float(passes), "gradient_norm": float(norm)}
+    state.metrics = {"delta": delta, **spent.means(n_strata), "passes": float(passes), "gradient_norm": norm}
     state.metrics |= control.means()
 
 
@@ -197,7 +199,7 @@ def _train(config: TrainConfig) -> TrainState:
     traces = open_traces(config)
     state = new_state(config, traces)
     if (config.out / "checkpoint.pt").exists():
-        load_checkpoint(config.out / "checkpoint.pt", config, state)
+        load_checkpoint(config.out / "checkpoint.pt", config, state, traces.layout)
     _check_together(config, state)
     training, held_out = traces.split(config.held_out)
     if not len(training):

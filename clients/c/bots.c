@@ -239,10 +239,12 @@ void bots_close(bots_client *client)
 
 const bots_error *bots_last_error(const bots_client *client)
 {
-    return &client->error;
+    static const bots_error no_client = {.status = BOTS_BAD_ARGUMENT, .retry_after_s = -1.0, .detail = "there is no client"};
+
+    return client ? &client->error : &no_client;
 }
 
 uint64_t bots_n_late(const bots_client *client)
 {
-    return client->n_late;
+    return client ? client->n_late : 0;
 }

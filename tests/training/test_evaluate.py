@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ import pytest
 from game.env import ACTION_SPEC, feature_table
 from tests.bundles import make_bundle
 from tests.training.line import LINE
-from training.evaluate import EvaluateConfig, evaluate
+from training.evaluate import EvaluateConfig, _normalised, evaluate, main
 from training.heat_map import HeatMap
 
 ENVIRONMENT = "game.env:Navigation-hard-v0"
@@ -138,3 +140,40 @@ def test_a_bundle_without_an_environment_needs_one(bundle: Path) -> None:
 def test_refuses_settings_that_cannot_be(settings: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
         EvaluateConfig(Path("nowhere"), **settings)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_an_evaluation_that_is_stopped_stops_with_all_that_play(number: signal.Signals) -> None:
+    """Its workers hold its standard error; when nobody does any more, it ends."""
+    bundle = Path(__file__).parents[2] / "bundles" / "easy"
+    command = [sys.executable, "-m", "training.evaluate", str(bundle), "--episodes", "20000", "--workers", "2"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=bundle.parents[1]) as running:
+        children = Path(f"/proc/{running.pid}/task/{running.pid}/children")
+        while len(children.read_text().split()) < 3:  # two that play, and one that counts what they share
+            assert running.poll() is None
+            time.sleep(0.01)
+        running.send_signal(number)
+        said = running.communicate(timeout=60)[1].decode()
+    assert running.returncode == {signal.SIGINT: 1, signal.SIGTERM: 143, signal.SIGKILL: -9}[number]
+    assert "Traceback" not in said
+
+
+def test_d4rls_score_is_0_and_100_at_its_references() -> None:
+    references = "-280.178953 12135.0"
+    assert _normalised(-280.178953, references) == pytest.approx(0.0)
+    assert _normalised(12135.0, references) == pytest.approx(100.0)
+    assert _normalised(1.0, None) is None
+
+
+def test_a_record_of_before_is_replaced_only_where_it_is_named(
+    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle = tmp_path / "tiny"
+    shutil.copytree(tiny, bundle)
+    (bundle / "evaluation.json").write_text("of 256 episodes")
+    asked = [str(bundle), "--environment", LINE, "--episodes", "2", "--workers", "1"]
+    main(asked)
+    assert (bundle / "evaluation.json").read_text() == "of 256 episodes"
+    assert "stays as it is" in capsys.readouterr().err
+    main([*asked, "--out", str(bundle / "evaluation.json")])
+    assert json.loads((bundle / "evaluation.json").read_text())["episodes"] == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from training.config import TrainConfig
 from training.draws import draw_share
 from training.objectives import query_cost
 from training.traces import Traces, choose_windows, load_traces
-from training.train import TrainState, main, new_state, train, update
+from training.train import TrainState, learning_rate, main, new_state, train, update
 
 
 def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Path, TrainState]) -> None:
@@ -283,3 +284,39 @@ def test_a_late_long_episode_is_enough_for_a_bundle(dataset: Path) -> None:
     example = traces.example
     assert len(example.returns_to_go_T) == traces.lengths_E[longest]
     assert torch.equal(example.free_TF, traces.episode(longest).free_TF)
+
+
+def test_a_network_without_a_number_in_it_replaces_no_checkpoint(dataset: Path, tmp_path: Path) -> None:
+    config = toy.config(dataset, tmp_path / "run", updates=40, learning_rate=900.0, checkpoint_every=1, warmup=1)
+    with pytest.raises(ValueError, match=r"update \d+ has no finite gradient: try a lower learning_rate"):
+        train(dataclasses.replace(config, gradient_clip=900.0))
+    weights = load_trained(tmp_path / "run" / "checkpoint.pt").model.state_dict().values()
+    assert all(torch.isfinite(weight).all() for weight in weights if weight.is_floating_point())
+
+
+def test_two_do_not_train_one_run(dataset: Path, tmp_path: Path) -> None:
+    config = toy.config(dataset, tmp_path / "run", updates=2)
+    train(config)
+    with (tmp_path / "run" / "metrics.jsonl").open("a") as lines:
+        fcntl.flock(lines, fcntl.LOCK_EX)
+        with pytest.raises(ValueError, match="is being trained by another process"):
+            train(dataclasses.replace(config, updates=4))
+    assert train(dataclasses.replace(config, updates=4)).done == 4
+
+
+def test_a_line_of_metrics_that_was_cut_is_dropped(dataset: Path, tmp_path: Path) -> None:
+    config = toy.config(dataset, tmp_path / "run", updates=4, log_every=1)
+    train(config)
+    metrics = tmp_path / "run" / "metrics.jsonl"
+    metrics.write_text(metrics.read_text()[:-30])
+    train(dataclasses.replace(config, updates=6))
+    assert [json.loads(line)["update"] for line in metrics.read_text().splitlines()] == [1, 2, 3, 5, 6]
+
+
+def test_the_learning_rate_warms_up_and_falls_to_zero() -> None:
+    config = toy.config(Path("d-v0"), Path("run"), updates=100, warmup=10, learning_rate=0.5)
+    rates = [learning_rate(config, done) for done in range(101)]
+    assert rates[0] == pytest.approx(0.05)
+    assert max(rates) == rates[9] == pytest.approx(0.5, rel=0.03)
+    assert rates[50] == pytest.approx(0.25)
+    assert rates[100] == pytest.approx(0.0)
