@@ -87,14 +87,16 @@ class TrainConfig:
         for name in ("budget", "frame_budget", "held_out", "beginnings"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
-        for name in ("learning_rate", "gradient_clip", "penalty_step"):
+        for name in ("learning_rate", "gradient_clip"):
             if not 0.0 < getattr(self, name) <= _MOST:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected above 0 and at most {_MOST:g}")
         if not 0 <= self.seed < 2**63:
             raise ValueError(f"seed is {self.seed}, expected 0 or more")
-        for name in ("acquisition_bias", "weight_decay"):
-            if not abs(getattr(self, name)) <= _MOST:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at most {_MOST:g} either way")
+        for name in ("penalty_step", "weight_decay"):
+            if not 0.0 <= getattr(self, name) <= _MOST:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 0 to {_MOST:g}")
+        if not abs(self.acquisition_bias) <= _MOST:
+            raise ValueError(f"acquisition_bias is {self.acquisition_bias}, expected at most {_MOST:g} either way")
         for told in (self.target_return, *(self.reference_returns or ())):
             if told is not None and not abs(told) <= MAX_RETURN:
                 raise ValueError(f"a return is {told}, expected at most {MAX_RETURN:g} either way")

@@ -51,7 +51,10 @@ def test_ctrl_c_says_what_becomes_of_the_work() -> None:
         (("training.evaluate", "nowhere"), "BAD_BUNDLE: manifest.json"),
         (("training.evaluate", str(ROOT / "bundles" / "easy"), "--environment", "Nope-v0"), "Nope"),
         (("training.evaluate", str(ROOT / "bundles" / "easy"), "--environment", "nope:Nope-v0"), "nope"),
-        (("training.evaluate", str(ROOT / "bundles" / "easy"), "--out", "nowhere/e.json"), "nowhere is not a folder"),
+        (
+            ("training.evaluate", str(ROOT / "bundles" / "easy"), "--out", "nowhere/e.json"),
+            "nowhere/e.json is a folder or in none",
+        ),
         (("training.draft_map", "nowhere", "map.json"), "nowhere is not a Minari dataset"),
     ],
     ids=lambda part: "-".join(part)[-40:] if isinstance(part, tuple) else "",
