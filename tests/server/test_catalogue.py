@@ -14,7 +14,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from protocol.client import BotClient
-from protocol.errors import BadBundle, NoBundle
+from protocol.errors import BadBundle, NoBot, NoBundle
+from protocol.resuming import ResumingClient
 from tests.bundles import make_bundle, rehash
 from tests.server.serving import HttpAnswer, Served, http_request, play, same, serve
 
@@ -225,3 +226,15 @@ def test_connections_that_hold_on_to_old_versions_do_not_fill_the_memory(
             assert (code(refused), refused.headers["retry-after"]) == ((503, "NOT_READY"), "1")
             assert (listed(served)["tiny"]["active"], listed(served)["tiny"]["previous"]) == (1, 3)
         assert admin(served, "tiny/activate", {"version": 2}).status == 200
+
+
+def test_a_line_that_breaks_after_an_exchange_ends_its_bots_for_good(served: Served) -> None:
+    """It was the last to hold the version that they began with."""
+    with ResumingClient(served.addresses["unix"], timeout_s=WAIT_S) as client:
+        client.hello(token=TOKEN, bundle="tiny")
+        table, bots = client.welcome.features, client.start(1)
+        play(client, table, bots, range(2))
+        assert admin(served, "tiny/activate", {"version": 1}).status == 200
+        client._client._transport.close()
+        with pytest.raises(NoBot, match="another version is served now"):
+            play(client, table, bots, range(2, 3))

@@ -6,6 +6,7 @@ import array
 import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,6 +112,16 @@ def test_what_cannot_be_served_ends_with_2_and_says_why(bundle: Path, arguments:
     assert ended.returncode == 2
     assert "Traceback" not in ended.stderr
     assert said in ended.stderr
+
+
+def test_a_store_whose_recorded_version_is_missing_ends_with_2(bundle: Path, tmp_path: Path) -> None:
+    shutil.copytree(bundle, tmp_path / "tiny" / "1")
+    (tmp_path / "tiny" / "active.json").write_text('{"active":{"version":9,"sha256":"00"},"previous":null}')
+    command = [sys.executable, "-m", "server", "--port", "0", "--store", str(tmp_path)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=START_S)
+    assert ended.returncode == 2
+    assert "no version 9 of tiny is in the store" in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 def test_a_door_in_use_is_not_taken_and_a_successors_is_left_alone(bundle: Path, tmp_path: Path) -> None:

@@ -280,3 +280,14 @@ def test_turns_of_before_have_no_deadline_where_the_server_has_a_default(impatie
     with ResumingClient(impatient.addresses[door]) as client, ResumingClient(impatient.addresses[door]) as unbroken:
         assert run(client, client._client._transport.close) == run(unbroken, lambda: None)
         assert (client.resumed, unbroken.resumed) == (24, 0)
+
+
+def test_bots_whose_rewards_left_every_target_behind_go_on(tiny: Bundle) -> None:
+    mortal, largest = Mortal(tiny, {6: "before"}), np.array([1e9], np.float32)
+    client = resuming(mortal)
+    client.hello()
+    bots, everything = client.start(1), np.zeros((1, TABLE.n_costly), np.float32)
+    for frame in range(4):
+        asked = client.query(bots, frame, free_numbers(TABLE, 1, frame), largest).queries
+        client.act(bots, frame, asked, everything)
+    assert client.resumed == 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -292,25 +291,6 @@ def test_a_network_without_a_number_in_it_replaces_no_checkpoint(dataset: Path, 
         train(dataclasses.replace(config, gradient_clip=900.0))
     weights = load_trained(tmp_path / "run" / "checkpoint.pt").model.state_dict().values()
     assert all(torch.isfinite(weight).all() for weight in weights if weight.is_floating_point())
-
-
-def test_two_do_not_train_one_run(dataset: Path, tmp_path: Path) -> None:
-    config = toy.config(dataset, tmp_path / "run", updates=2)
-    train(config)
-    with (tmp_path / "run" / "metrics.jsonl").open("a") as lines:
-        fcntl.flock(lines, fcntl.LOCK_EX)
-        with pytest.raises(ValueError, match="is being trained by another process"):
-            train(dataclasses.replace(config, updates=4))
-    assert train(dataclasses.replace(config, updates=4)).done == 4
-
-
-def test_a_line_of_metrics_that_was_cut_is_dropped(dataset: Path, tmp_path: Path) -> None:
-    config = toy.config(dataset, tmp_path / "run", updates=4, log_every=1)
-    train(config)
-    metrics = tmp_path / "run" / "metrics.jsonl"
-    metrics.write_text(metrics.read_text()[:-30])
-    train(dataclasses.replace(config, updates=6))
-    assert [json.loads(line)["update"] for line in metrics.read_text().splitlines()] == [1, 2, 3, 5, 6]
 
 
 def test_the_learning_rate_warms_up_and_falls_to_zero() -> None:
