@@ -32,6 +32,7 @@ class Looks:
         self.backlog_us = 0.0  # what the jobs that wait will take, by what was expected of them
         self._is_taken = self._is_ending = False
         self._first_ns: int | None = None  # when the first request of this look was read
+        self._began_ns = 0  # when anything was known of this look, with a deadline or without
         self._since_ns = self._last_ns = self._ended_ns = 0
 
     def __len__(self) -> int:
@@ -69,12 +70,13 @@ class Looks:
     def _expect_end(self) -> None:
         if not self._is_ending:
             self._is_ending = True
+            self._began_ns = self._clock()
             asyncio.get_running_loop().call_soon(self._end)
 
     def _end(self) -> None:
         """All that this look found was read; before the next, whoever is first in the line."""
         self._is_ending = self._is_taken = False
-        self._last_ns = self._ended_ns if self._first_ns is None else self._first_ns
+        self._last_ns = self._began_ns if self._first_ns is None else self._first_ns
         self._first_ns = None
         if not self._waiting:
             asyncio.get_running_loop().call_soon(self._afterwards)  # behind the answers of those that waited

@@ -140,3 +140,15 @@ def test_a_look_that_found_nothing_counts_as_one() -> None:
         assert looks.since_ns(clock.ns + 1) == ended_ns
 
     run(test)
+
+
+def test_a_look_without_deadlines_after_a_sleep_counts_from_itself() -> None:
+    async def test(looks: Looks, clock: Clock) -> None:
+        clock.ns += 3_600_000 * MS  # nothing for an hour
+        slept_ns = clock.ns
+        looks.take()
+        await asyncio.sleep(0)
+        clock.ns += MS // 10
+        assert looks.since_ns(clock.ns) == slept_ns
+
+    run(test)
