@@ -179,12 +179,7 @@ def endless(dataset: Path, tmp_path: Path) -> Iterator[tuple[subprocess.Popen[by
     """A sweep of one long run, which has made its first checkpoint; and the run's folder."""
     spec = write_spec(tmp_path, dataset, [{}], updates=10**6, checkpoint_every=1)
     (run,) = SweepSpec.read(spec).runs()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "training.sweep", str(spec)],
-        stdout=subprocess.DEVNULL,
-        # Tests that run in a shell's background inherit that Ctrl-C is ignored.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    process = subprocess.Popen([sys.executable, "-m", "training.sweep", str(spec)], stdout=subprocess.DEVNULL)
     try:
         while not (run.config.out / "checkpoint.pt").exists():
             assert process.poll() is None
