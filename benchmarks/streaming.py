@@ -27,7 +27,7 @@ from training.shard import step_bytes
 from training.shards import write_shards
 from training.steps import Layout, Steps, costly_type
 from training.trace_source import open_traces
-from training.train import new_state, update
+from training.update import new_state, update
 
 __all__ = ["Streaming", "main", "measure"]
 

@@ -38,7 +38,7 @@ from training.objectives import action_loss, query_cost
 from training.policy import Known
 from training.steps import Layout
 from training.traces import Traces
-from training.train import TrainState, know, new_state
+from training.update import TrainState, know, new_state
 
 __all__ = ["Training", "main", "measure"]
 

@@ -9,7 +9,7 @@ import io
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import torch
@@ -22,9 +22,7 @@ from training.policy import BudgetedPolicy, ModelConfig
 from training.replace_file import replace_file
 from training.steps import Layout
 from training.trace_source import TraceSource
-
-if TYPE_CHECKING:
-    from training.train import TrainState
+from training.update import TrainState
 
 __all__ = ["Facts", "Trained", "load_checkpoint", "load_trained", "save_checkpoint"]
 
@@ -89,12 +87,13 @@ def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainS
 
 
 def load_checkpoint(path: Path, config: TrainConfig, state: TrainState, layout: Layout) -> None:
-    """Continue a run: its settings must be those it began with, but for how long it goes on. Raises ValueError."""
+    """Continue a run: its settings must be those it began with, but for how long it goes on and where. Raises
+    ValueError."""
     data = _read(path)
     state.done, state.seconds = data["done"], data["seconds"]
     theirs, ours = _decode_config(data["config"]), config
     for name, value in asdict(ours).items():
-        if name not in ("out", "updates", "log_every", "checkpoint_every") and getattr(theirs, name) != value:
+        if name not in ("out", "device", "updates", "log_every", "checkpoint_every") and getattr(theirs, name) != value:
             raise ValueError(
                 f"{path} was trained with {name} {getattr(theirs, name)}, this run has {value}: use another out"
             )

@@ -5,8 +5,10 @@ This module knows nothing about bundles or environments.
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +50,9 @@ class HeatMap(NamedTuple):
     def read(cls, path: Path) -> HeatMap:
         """Read what `write` wrote. Raises ValueError for anything else."""
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 arrays = [data[name] for name in cls._fields]
-        except (KeyError, EOFError, OSError, ValueError) as error:
+        except (KeyError, EOFError, OSError, ValueError, BadZipFile, zlib.error) as error:
             raise ValueError(f"{path} is no heat map, expected an .npz with {list(cls._fields)}: {error}") from error
         probs_TM, alive_T, costs_M, names = arrays
         if probs_TM.shape != (alive_T.size, costs_M.size) or names.shape != costs_M.shape:

@@ -9,7 +9,7 @@ import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import torch
 from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -19,9 +19,7 @@ from training.checkpoint import Facts, save_checkpoint
 from training.config import TrainConfig
 from training.replace_file import replace_file
 from training.statistics import Statistics
-
-if TYPE_CHECKING:
-    from training.train import TrainState
+from training.update import TrainState
 
 __all__ = ["RunRecord", "write_versions"]
 

@@ -42,7 +42,7 @@ _SAME_COST = 1e-4  # relative: a heat map is rounded to float32, and no two eval
 class ReportConfig:
     """What is reported, and where to."""
 
-    results: tyro.conf.Positional[Path]  # folder of run folders
+    results: tyro.conf.Positional[Path]  # folder of run folders, or one of them
     paper: tuple[Path, ...] = ()  # tables of the paper as CSV (none: without the paper's figures)
     paper_dataset: str = ""  # the paper's dataset shown beside ours of other names (empty: beside its namesake only)
     out: Path | None = None  # folder of report.md and figures/ (None: `report` in the folder of results)
@@ -169,6 +169,8 @@ def _measured(measurements: Sequence[Measurement]) -> str:
         return "Nothing was measured."
     episodes = _range(one.numbers.episodes for one in measurements)
     seeds = _list(one.seed for one in measurements)
+    if len(measurements) == 1:
+        return f"One evaluation of {episodes} episodes, training seed {seeds}."
     return f"{len(measurements)} evaluations of {episodes} episodes each, training seeds {seeds}."
 
 

@@ -140,8 +140,10 @@ class Results:
 
     @classmethod
     def read(cls, folder: Path) -> Results:
-        """Read every run folder in `folder`. Raises ValueError naming the file, also for two runs of one cell."""
-        configs = sorted(folder.glob("*/config.json"))
+        """Read every run folder in `folder`, or the one that it is itself. Raises ValueError naming the file, also for
+        two runs of one cell."""
+        own = folder / "config.json"
+        configs = [own] if own.exists() else sorted(folder.glob("*/config.json"))
         if not configs:
             raise ValueError(f"{folder} holds no runs, expected <run>/config.json")
         runs = [Run(path.parent, TrainConfig.read(path)) for path in configs]

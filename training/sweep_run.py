@@ -25,6 +25,7 @@ import msgspec
 
 from training.config import TrainConfig
 from training.evaluate import EvaluateConfig, evaluate, write_evaluation
+from training.replace_file import replace_file
 
 __all__ = ["Run", "launch", "perform"]
 
@@ -73,7 +74,7 @@ class Run:
             return 0  # only shown, and never a reason to stop other runs
 
     def state(self) -> Literal["new", "begun", "done"]:
-        """How far the folder is. Raises ValueError where it was made with other settings."""
+        """How far the folder is. Raises ValueError where it was made with other settings, or a file of it is broken."""
         out = self.config.out
         if (out / "config.json").exists():
             theirs = TrainConfig.read(out / "config.json")
@@ -82,18 +83,25 @@ class Run:
                     raise ValueError(_changed(out, name, getattr(theirs, name), value))
         for asked in self.evaluations.values():
             if asked.out is not None and asked.out.exists():
-                episodes = msgspec.json.decode(asked.out.read_bytes())["episodes"]
+                episodes = _read(asked.out, "episodes")
                 if episodes != asked.episodes:
                     raise ValueError(_changed(asked.out, "episodes", episodes, asked.episodes))
         marker = out / "done.json"
         whole = marker.exists() and (self.bundle / "manifest.json").exists() and not self.missing()
-        if whole and msgspec.json.decode(marker.read_bytes())["settings"] == self.fingerprint():
+        if whole and _read(marker, "settings") == self.fingerprint():
             return "done"
         return "begun" if out.exists() else "new"
 
 
 def _changed(path: Path, name: str, theirs: object, ours: object) -> str:
     return f"{path} was made with {name} {theirs}, the sweep has {ours}: delete it, or give the sweep another out"
+
+
+def _read(path: Path, name: str) -> object:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=dict)[name]
+    except (msgspec.DecodeError, KeyError) as error:
+        raise ValueError(f"{path} is broken, delete it and it is made again: {error}") from error
 
 
 def _terms(asked: EvaluateConfig) -> list[object]:
@@ -123,7 +131,7 @@ def perform(run: Run, workers: int) -> None:
     for label in run.missing():
         _say(f"evaluating {label}")
         _evaluate(dataclasses.replace(run.evaluations[label], workers=workers))
-    _place(out / "done.json", msgspec.json.format(msgspec.json.encode({"settings": run.fingerprint()})) + b"\n")
+    replace_file(out / "done.json", msgspec.json.format(msgspec.json.encode({"settings": run.fingerprint()})) + b"\n")
     _say("done")
 
 
@@ -137,12 +145,6 @@ def _evaluate(asked: EvaluateConfig) -> None:
         partial = asked.out.with_suffix(".partial")
         write_evaluation(partial, evaluation, episodes)
         os.replace(partial, asked.out)
-
-
-def _place(path: Path, data: bytes) -> None:
-    partial = path.with_suffix(".partial")
-    partial.write_bytes(data)
-    os.replace(partial, path)
 
 
 def _say(what: str) -> None:

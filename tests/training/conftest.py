@@ -8,7 +8,8 @@ import torch
 from tests.training import toy
 from training.shards import write_shards
 from training.traces import load_traces
-from training.train import TrainState, train
+from training.train import train
+from training.update import TrainState
 
 
 @pytest.fixture(autouse=True)

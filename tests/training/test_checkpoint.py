@@ -15,7 +15,8 @@ from tests.training import toy
 from tests.training.test_sink import most_bytes_of_a_file
 from training.checkpoint import Facts, load_checkpoint, load_trained
 from training.traces import load_traces
-from training.train import new_state, train
+from training.train import train
+from training.update import new_state
 
 
 def test_a_turns_reward_is_the_one_since_the_turn_before(dataset: Path) -> None:

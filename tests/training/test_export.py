@@ -15,7 +15,8 @@ from protocol.errors import BadBundle
 from tests.training import toy
 from training.checkpoint import load_trained
 from training.export import ExportConfig, export
-from training.train import TrainState, train
+from training.train import train
+from training.update import TrainState
 
 
 @pytest.fixture(scope="module")

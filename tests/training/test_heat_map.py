@@ -57,6 +57,12 @@ def test_refuses_what_is_no_heat_map(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is no heat map, expected"):
         HeatMap.read(path)
     heat = counted([np.full((4, N_QUERIES), 0.25)]).mean(COSTS, NAMES)
+    heat.write(path)
+    whole = path.read_bytes()
+    for broken in (whole[: len(whole) // 2], whole.replace(whole[60:70], bytes(10))):
+        path.write_bytes(broken)
+        with pytest.raises(ValueError, match="is no heat map, expected"):
+            HeatMap.read(path)
     heat._replace(alive_T=heat.alive_T[:2]).write(path)
     with pytest.raises(ValueError, match=r"expected \[\[T, M\]"):
         HeatMap.read(path)

@@ -49,6 +49,24 @@ def test_values_and_weights_favour_the_action_that_earns() -> None:
     assert (weights <= 100.0).all()
 
 
+def test_value_is_drawn_to_the_upper_end_of_the_lesser_q() -> None:
+    """Eq. 5 there with τ = 0.7, by hand."""
+    torch.manual_seed(0)
+    state, action, togo, last, valid = chain(4)
+    critics = Critics(4, 1, reward_scale=1.0)
+    with torch.no_grad():
+        both = torch.cat([state, action], dim=-1)
+        one, other = (q(both)[..., 0] for q in critics.target_q)
+        gap = torch.minimum(one, other) - critics.value(state)[..., 0]
+        critics.value[-1].bias += gap.median()  # else V is on one side of all
+        gap -= gap.median()
+    assert (one < other).any()
+    assert (other < one).any()
+    expected = sum(d * d * (0.7 if d > 0 else 0.3) for d in gap.flatten().tolist()) / gap.numel()
+    assert critics(state, action, togo, last, valid)[0].item() == pytest.approx(expected, rel=1e-4)
+    assert critics.weights(state, action).flatten().tolist() == pytest.approx((3.0 * gap).exp().flatten().tolist())
+
+
 def test_a_windows_last_timestep_without_successor_teaches_q_nothing() -> None:
     torch.manual_seed(0)
     state, action, togo, last, valid = chain(4)

@@ -41,6 +41,17 @@ def test_the_worse_a_frame_is_told_the_more_it_counts(dataset: Path, blind: Path
     assert weights_S[first].std() > 0.01, "no frame is surer than another"
 
 
+def test_a_frame_that_nothing_explains_counts_no_more_than_four_mean_ones(dataset: Path, blind: Path) -> None:
+    """Nobody ever waits: a network that has learned so finds a wait ever less likely than all else."""
+    traces = load_traces(dataset)
+    waited = [3, 20, 41]
+    traces.actions_SA[waited, 1] = 1.0
+    weights_S = weigh_keyframes(blind, traces).weights_S
+    assert weights_S is not None
+    assert weights_S[waited].tolist() == [weights_S.max().item()] * 3
+    assert (weights_S == weights_S.max()).sum() == 3
+
+
 def test_windows_carry_their_weights(dataset: Path, blind: Path) -> None:
     traces = weigh_keyframes(blind, load_traces(dataset))
     windows = choose_windows(traces, 4, 6, np.random.default_rng(0))

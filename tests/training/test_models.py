@@ -7,6 +7,7 @@ import torch
 
 from tests.training.test_acquisition import M, batch, know, network
 from training.models import BudgetedDecisionTransformer
+from training.policy import _cost_waves
 
 
 def hidden_states(model: BudgetedDecisionTransformer, free, costly, togo, query) -> torch.Tensor:
@@ -82,3 +83,9 @@ def test_a_target_cost_outside_what_was_trained_is_the_nearest_that_was() -> Non
 
     assert torch.equal(asked(0.0), asked(0.01))
     assert not torch.allclose(asked(0.02), asked(0.01), atol=1e-4)
+
+
+def test_the_target_cost_is_told_on_a_logarithmic_scale() -> None:
+    told = _cost_waves(torch.tensor([[0.001], [0.01], [0.1], [1.0], [2.0]]), 0.01, 1.0)
+    assert told[:, 0].tolist() == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
+    assert told[2, 1:].tolist() == pytest.approx([1.0, 0.0, 0.0, -1.0, 0.0, 1.0], abs=1e-6)

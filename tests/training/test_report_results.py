@@ -94,6 +94,16 @@ def test_other_files_are_told_of_and_broken_ones_refused(tmp_path: Path) -> None
         Results.read(tmp_path)
 
 
+def test_a_run_is_a_folder_of_one(tmp_path: Path) -> None:
+    """Its bundle, which has a config.json too, is no run of it."""
+    run = write_run(tmp_path, "run")
+    write_evaluation(run, "soft-0.1", 80.0, 9.0, 9.0)
+    write_run(run, "bundle")
+    results = Results.read(run)
+    assert [one.folder for one in results.runs] == [run]
+    assert len(results.measurements) == 1
+
+
 def test_a_folder_without_runs_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"holds no runs, expected <run>/config\.json"):
         Results.read(tmp_path)

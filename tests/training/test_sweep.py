@@ -141,6 +141,17 @@ def test_other_settings_for_a_folder_are_refused(
     assert files(results) == before
 
 
+@pytest.mark.parametrize("name", ["done.json", "evaluations/soft-0.2.json"])
+def test_a_broken_file_is_named(spec: Path, results: Path, name: str) -> None:
+    file = results / DONE[0] / name
+    whole = file.read_bytes()
+    for broken in (whole[:9], b"{}"):
+        file.write_bytes(broken)
+        with pytest.raises(ValueError, match=rf"{file} is broken, delete it and it is made again"):
+            sweep(SweepConfig(spec))
+    file.write_bytes(whole)
+
+
 def test_a_dry_run_lists_and_does_nothing(
     spec: Path, results: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

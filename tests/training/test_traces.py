@@ -62,6 +62,16 @@ def test_a_window_within_an_episode_counts_from_its_burn_in_on(dataset: Path, bu
         assert counted_T == [first <= t and step < length for t, step in enumerate(step_T)]
 
 
+def test_an_episodes_ends_are_met_half_as_often_as_its_middle(dataset: Path) -> None:
+    """A window of 4 in an episode of 20 starts anywhere from 2 before it to 2 before its end, then is moved into it."""
+    windows = choose_windows(load_traces(dataset), 200_000, 4, np.random.default_rng(0))
+    starts = windows.step_BT[windows.length_B == 20, 0]
+    met = np.bincount(starts, minlength=17) / len(starts)
+    assert met[0] == pytest.approx(3 / 20, rel=0.2)
+    assert met[1:16] == pytest.approx(np.full(15, 1 / 20), rel=0.2)
+    assert met[16] == pytest.approx(2 / 20, rel=0.2)
+
+
 def test_held_out_episodes_are_never_drawn(dataset: Path) -> None:
     kept, rest = load_traces(dataset).split(0.25)
     assert (len(kept.lengths_E), len(rest.lengths_E)) == (30, 10)

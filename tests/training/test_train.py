@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,10 +14,9 @@ from training.acquisition import rollout, sample_queries
 from training.build import build_model
 from training.checkpoint import load_trained
 from training.config import TrainConfig
-from training.draws import draw_share
-from training.objectives import query_cost
-from training.traces import Traces, choose_windows, load_traces
-from training.train import TrainState, learning_rate, main, new_state, train, update
+from training.traces import load_traces
+from training.train import main, train
+from training.update import TrainState
 
 
 def test_learns_which_features_tell_the_action(dataset: Path, trained: tuple[Path, TrainState]) -> None:
@@ -96,41 +93,6 @@ def test_a_conditioned_network_asks_for_more_where_it_may(dataset: Path, tmp_pat
             for c in (0.02, 0.9)
         ]
     assert asked[1] > 1.2 * asked[0]
-
-
-def test_while_its_memory_fills_a_window_teaches_nothing_and_moves_no_weight_of_the_cost(
-    dataset: Path, tmp_path: Path
-) -> None:
-    config, traces = toy.config(dataset, tmp_path, burn_in=5, batch=4, control="dual"), load_traces(dataset)
-    windows = choose_windows(traces, 4, 12, np.random.default_rng([0, 0]))
-    index_BT, counted_BT = windows.first_B[:, None] + windows.step_BT, windows.counted_BT(5).bool().numpy()
-    taught = np.unique(index_BT[counted_BT])
-    burnt = np.setdiff1d(index_BT[windows.valid_BT.bool().numpy() & ~counted_BT], taught)
-    assert len(burnt) >= 5
-    as_recorded, other_burnt, other_taught = (
-        _updated(config, _pushed_otherwise(traces, steps)) for steps in ([], burnt, taught)
-    )
-    for name, value in as_recorded.model.state_dict().items():
-        assert torch.equal(value, other_burnt.model.state_dict()[name]), name
-    assert as_recorded.metrics["delta"] != other_taught.metrics["delta"]
-    drawn, fresh = draw_share(config, traces, np.random.default_rng([0, 0])), new_state(config, traces)
-    costs_M = torch.tensor(toy.FEATURES.costs_us, dtype=torch.float32)
-    cost_BT = query_cost(fresh.forward(drawn)[0].query_BTM.detach(), costs_M)
-    assert as_recorded.metrics["cost"] == pytest.approx(cost_BT[torch.from_numpy(counted_BT)].mean().item())
-    fresh.control.observe(cost_BT, drawn.target_B, drawn.stratum_B, torch.from_numpy(counted_BT).float())
-    assert as_recorded.control.weights == pytest.approx(fresh.control.weights)
-
-
-def _pushed_otherwise(traces: Traces, steps: Sequence[int]) -> Traces:
-    actions_SA = traces.actions_SA.clone()
-    actions_SA[list(steps), 0] *= -1.0
-    return dataclasses.replace(traces, actions_SA=actions_SA)
-
-
-def _updated(config: TrainConfig, traces: Traces) -> TrainState:
-    state = new_state(config, traces)
-    update(config, state, traces, torch.tensor(toy.FEATURES.costs_us, dtype=torch.float32))
-    return state
 
 
 def train_interrupted(config: TrainConfig, after: int) -> None:
@@ -265,6 +227,7 @@ def test_command_line_overrides_its_configuration_file(
             {"context_length": 29, "window": 40},
             r"has 29 timesteps .* expected more than context_length 29",
         ),
+        ({"device": "cuda:99"}, "device is cuda:99, expected one that this machine and torch have: "),
         ({"held_out": 0.99}, "held_out 0.99 of 40 episodes leaves none to train on"),
     ],
 )
@@ -291,12 +254,3 @@ def test_a_network_without_a_number_in_it_replaces_no_checkpoint(dataset: Path, 
         train(dataclasses.replace(config, gradient_clip=900.0))
     weights = load_trained(tmp_path / "run" / "checkpoint.pt").model.state_dict().values()
     assert all(torch.isfinite(weight).all() for weight in weights if weight.is_floating_point())
-
-
-def test_the_learning_rate_warms_up_and_falls_to_zero() -> None:
-    config = toy.config(Path("d-v0"), Path("run"), updates=100, warmup=10, learning_rate=0.5)
-    rates = [learning_rate(config, done) for done in range(101)]
-    assert rates[0] == pytest.approx(0.05)
-    assert max(rates) == rates[9] == pytest.approx(0.5, rel=0.03)
-    assert rates[50] == pytest.approx(0.25)
-    assert rates[100] == pytest.approx(0.0)
