@@ -22,9 +22,11 @@ from protocol.errors import OverBudget
 if TYPE_CHECKING:  # a turn is a company's, and a company remembers its last turn
     from bot_runtime.turns import Turn
 
-__all__ = ["MAX_COMPANIES", "Companies", "Company", "Means"]
+__all__ = ["ORDERS", "Companies", "Company", "Means"]
 
-MAX_COMPANIES = 256  # a few kB each; an engine that names its bots in ever new orders pushes out the oldest
+ORDERS = 4
+"""Of all bots that there may be, so many times over in companies: each bot of one takes some kB. An engine that names
+its bots in ever new orders pushes out the oldest."""
 # What stays this far below a budget needs no allocation, for allocation keeps back less than that of it.
 _AMPLE = 1.0 - 1e-6
 _Floats = NDArray[np.float64]
@@ -77,11 +79,11 @@ class Means:
         budgets_N = self.terms.budgets_N
         if not (cost_us_N <= budgets_N).all():
             row = int(np.argmax(cost_us_N > budgets_N))
-            said = f"the query of bot {row} of the message costs {cost_us_N[row]:g} µs"
-            raise OverBudget(f"{said}, expected at most its budget of {budgets_N[row]:g} µs")
+            said = f"the query of bot {row} of the message costs {float(cost_us_N[row])!r} us"
+            raise OverBudget(f"{said}, expected at most its budget of {float(budgets_N[row])!r} us")
         if frame_budget_us is not None and cost_us_N.sum() > frame_budget_us:
-            said = f"the message's queries cost {cost_us_N.sum():g} µs"
-            raise OverBudget(f"{said}, expected at most the frame's budget of {frame_budget_us:g} µs")
+            said = f"the message's queries cost {float(cost_us_N.sum())!r} us"
+            raise OverBudget(f"{said}, expected at most the frame's budget of {float(frame_budget_us)!r} us")
 
     def cost_us(self, query_NM: NDArray[np.bool_]) -> _Floats:
         """What a query costs, predicted µs, [N]."""
@@ -113,6 +115,7 @@ class Companies:
     def __init__(self, slots: Slots, contexts: Contexts, spending: Spending) -> None:
         self._slots, self._contexts, self._spending = slots, contexts, spending
         self._known: dict[bytes, Company] = {}
+        self._n_bots = 0  # of all of these
 
     def named(self, handles_N: NDArray[np.int64], unsaid: Limits) -> Company:
         """The company of these bots; `unsaid` are limits that say nothing. Raises what `Slots.resolve` raises."""
@@ -123,8 +126,9 @@ class Companies:
         slots_N = self._slots.resolve(handles_N)
         means = Means.of(self._spending.terms(slots_N, unsaid))
         company = Company(handles_N.copy(), self._contexts.batch(slots_N), means)
-        if len(self._known) == MAX_COMPANIES:
-            del self._known[next(iter(self._known))]
+        self._n_bots += company.n_bots
+        while self._n_bots > ORDERS * self._slots.capacity:
+            self._n_bots -= self._known.pop(next(iter(self._known))).n_bots
         self._known[key] = company
         return company
 
@@ -132,3 +136,4 @@ class Companies:
         """Forget every company that one of these was in."""
         gone = set(slots_N.tolist())
         self._known = {key: each for key, each in self._known.items() if gone.isdisjoint(each.slots_N.tolist())}
+        self._n_bots = sum(each.n_bots for each in self._known.values())

@@ -37,6 +37,8 @@ class Slots:
 
     def take(self, count: int) -> NDArray[np.int64]:
         """Occupy the `count` lowest free slots, shape [count]. Raises TooManyBots, taking none, if fewer are."""
+        if count > self.capacity:
+            raise TooManyBots(f"{count} bots never fit: there are {self.capacity} slots")
         free = np.flatnonzero(~self._live_B)
         if count > free.size:
             raise TooManyBots(

@@ -17,7 +17,7 @@ import msgpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from protocol.errors import NoConnection, ProtocolError
+from protocol.errors import NoConnection, ProtocolError, TooManyConnections
 from protocol.features import CostModel
 from protocol.packing import FLOAT, add_acquired, add_number, add_numbers, cost_model_dict, handles_of, matrix
 from protocol.replies import (
@@ -84,8 +84,11 @@ class BotClient:
         """Open a connection, with the engine's own cost model if it has measured one.
 
         `bundle` is a name, of which bots are started on the version that is then active, or NAME@VERSION, of that
-        version only.
+        version only. Another connection of this client ends with its socket or, over HTTP, when the server has not
+        heard of it for long enough: `close` ends it at once.
         """
+        if self._welcome is not None:
+            self._transport.close()
         self._welcome = None
         message: dict[str, Any] = {"type": "hello", "protocol": 1}
         if cost_model is not None:
@@ -234,7 +237,11 @@ class BotClient:
         """Send any message, as a dict, and return its reply's dict: the door for tests and for messages to come."""
         connection = None if self._welcome is None else self._welcome.connection
         body = self._transport.exchange(message["type"], self._packer.pack(message), connection)
-        return read_reply(body, message["type"])
+        try:
+            return read_reply(body, message["type"])
+        except (NoConnection, TooManyConnections):  # nothing will be answered on this socket but goodbye
+            self._transport.close()
+            raise
 
     def _framed(self, message: dict[str, Any]) -> dict[str, Any]:
         asked_ns = self._clock()

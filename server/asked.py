@@ -14,6 +14,7 @@ from bot_runtime.together import MAX_BOTS_EACH
 from bot_runtime.work import Steps
 from protocol.codec import Format
 from server.answer import Answer, Arrival
+from server.connections import Connection
 from server.pace import Kind, Pace
 from server.serving import Serving
 
@@ -24,7 +25,7 @@ class Asked(Struct, frozen=True):  # made anew for every request: see Arrival
     """How a request is answered, and by what it is known how long that takes.
 
     `turn` is what its pace goes by, None where it never stays on the event loop; `kind` and `size` what its whole does.
-    `serving` is what its connection holds, if there is one.
+    `connection` is the one that `connection_id` names, if there is one.
     """
 
     steps: Callable[[], Steps[Answer]]
@@ -35,7 +36,12 @@ class Asked(Struct, frozen=True):  # made anew for every request: see Arrival
     kind: type[object]
     size: int
     turn: Kind | None = None
-    serving: Serving | None = None
+    connection: Connection | None = None
+
+    @property
+    def serving(self) -> Serving | None:
+        """What its connection holds."""
+        return None if self.connection is None else self.connection.serving
 
     @property
     def work_us(self) -> float:

@@ -47,13 +47,15 @@ class Catalogue:
         """Load and activate, of each name, what was active last, else the highest version.
 
         For the start, before anything is served: it blocks. Raises BadBundle, OSError, and ValueError where the store
-        is empty.
+        is empty or has more names than there may be bundles in memory.
         """
         for name in self.store.names():
             record = self.store.record(name)
             versions = self.store.versions(name)
             if record is None and not versions:
                 continue
+            if len(list(self._servings)) == self._servings.max_loaded:
+                raise ValueError(f"--max-loaded is {self._servings.max_loaded}, and the store has more names")
             version = versions[-1] if record is None else record.active.version
             bundle = Bundle.load(self.store.path(name, version), keys=self._keys)
             _check(bundle, name, version, None if record is None else record.active.sha256)

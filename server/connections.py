@@ -26,7 +26,8 @@ class Connection:
     """One engine's link to the server; it alone may name its bots, which are bots of `serving`.
 
     `costs` are as it declared, then as it measures. `is_pinned` where the engine named the very version: no other will
-    do. `asked` is the last query that it was sent, as its reply has it and as bool [N, M].
+    do. `asked` is the last query that it was sent, as its reply has it and as bool [N, M]. `answered_ns` is when its
+    last turn was answered, by the desk's clock.
     """
 
     id: str
@@ -36,6 +37,7 @@ class Connection:
     is_pinned: bool = False
     bots: set[int] = field(default_factory=set)
     asked: tuple[object, NDArray[np.bool_]] | None = None
+    answered_ns: int = 0
 
     @property
     def measured_costs(self) -> Costs | None:
@@ -92,11 +94,18 @@ class Connections:
         return connection
 
     def get(self, connection_id: str | None) -> Connection:
-        """The connection of this name, which is thereby heard from; raises NoConnection, also if it is overdue."""
-        connection = self.peek(connection_id)
-        now_s = self._clock()
-        if connection is None or self._is_silent(connection, now_s):
+        """The connection of this name; raises NoConnection, also if it is overdue."""
+        connection = self.heard(connection_id)
+        if connection is None:
             raise NoConnection("say hello first" if connection_id is None else "no such connection: say hello again")
+        return connection
+
+    def heard(self, connection_id: str | None) -> Connection | None:
+        """A request has come, whatever becomes of it: the connection of this name, which is not silent, if there is one
+        that has not been silent for too long."""
+        connection, now_s = self.peek(connection_id), self._clock()
+        if connection is None or self._is_silent(connection, now_s):
+            return None
         connection.last_seen_s = now_s
         return connection
 

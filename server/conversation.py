@@ -14,9 +14,13 @@ from protocol.codec import Format
 from protocol.errors import TooManyConnections, Unauthorized
 from protocol.messages import Farewell, Welcome
 from server.answer import Answer, Arrival, refusal
+from server.logs import logger
 from server.sockets import Sockets
 
 __all__ = ["Conversation"]
+
+_LEAVE_S = 1.0  # how long a client that finds no room may take to say hello, and hear of it
+_log = logger(__name__)
 
 
 class Conversation(asyncio.Protocol):
@@ -35,6 +39,7 @@ class Conversation(asyncio.Protocol):
         self._is_stuck = False  # the client does not take what it was sent
         self._is_paused = False
         self._is_over = False  # whatever else comes is not looked at
+        self._refused: Answer | None = None  # to whatever comes first
         self._is_eof = False
 
     @abstractmethod
@@ -64,8 +69,9 @@ class Conversation(asyncio.Protocol):
             self._sockets.add(self)
         except TooManyConnections as error:
             self._sockets.desk.handlers.recorder.refused(self.name, error.code)
-            self._transport.write(self._framed(refusal(error, Format.MSGPACK).body))
-            self._close()
+            _log.warning("hello refused", transport=self.name, code=error.code)
+            self._refused = refusal(error, Format.MSGPACK)
+            self._expect(min(_LEAVE_S, self._sockets.frame_deadline_s))
 
     def _open(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
@@ -125,6 +131,10 @@ class Conversation(asyncio.Protocol):
             return
         if body is None:
             self._wait()
+            return
+        if self._refused is not None:
+            self._transport.write(self._framed(self._refused.body))
+            self._end()
             return
         self.is_busy, self._is_begun = True, False
         arrival = Arrival.now(self.name)

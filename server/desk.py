@@ -18,6 +18,7 @@ from protocol.errors import NotReady, ProtocolError
 from protocol.messages import Actions, Queries, Request, RequestQueries, SubmitFeatures, TakeTurn
 from server.answer import Answer, Arrival, refusal, steps
 from server.asked import Asked, companions
+from server.connections import Connection
 from server.due import Due
 from server.handlers import Handlers
 from server.looks import Looks
@@ -81,24 +82,27 @@ class Desk:
         reply_form: Format | None = None,
     ) -> Answered:
         """The answer, or the future of it. Arguments are those of `server.answer.answer`."""
-        reply_form, serving = reply_form or form, self.handlers.serving_of(connection_id)
-        pace = self._strangers if serving is None else serving.pace
+        reply_form, connection = reply_form or form, self.handlers.connections.heard(connection_id)
+        pace = self._strangers if connection is None else connection.serving.pace
         if len(body) > _MAX_INLINE_BYTES:
-            arrival = self._due_by(arrival, codec.peek_deadline_us(body, form))
+            arrival = self._due_by(arrival, codec.peek_deadline_us(body, form), connection)
             job = partial(steps, self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form)
-            return self._in_turn(Asked(job, arrival, reply_form, connection_id, pace, bytes, len(body)))
+            return self._in_turn(
+                Asked(job, arrival, reply_form, connection_id, pace, bytes, len(body), None, connection)
+            )
         try:
             request = codec.decode_request(body, form) if kind is None else codec.decode(body, form, kind)
         except ProtocolError:  # answered by refusing it, bots untouched
             return finished(steps(self.handlers, body, form, connection_id, arrival, kind=kind, reply_form=reply_form))
         decoded_ns, size, turn = time.monotonic_ns(), 0, None
         if isinstance(request, _TURNS):
-            arrival = self._due_by(arrival, request.deadline_us)
+            arrival = self._due_by(arrival, request.deadline_us, connection)
             size = len(request.bots)
             turn = type(request), size.bit_length()
         how = partial(steps, self.handlers, request, form, connection_id, arrival)
         begun = partial(how, reply_form=reply_form, decoded_ns=decoded_ns)
-        return self._in_turn(Asked(begun, arrival, reply_form, connection_id, pace, type(request), size, turn, serving))
+        kind = type(request)
+        return self._in_turn(Asked(begun, arrival, reply_form, connection_id, pace, kind, size, turn, connection))
 
     def end(self, connection_id: str) -> None:
         """End a connection whose socket has closed, after what was asked for on it."""
@@ -108,15 +112,18 @@ class Desk:
         else:
             job()
 
-    def _due_by(self, arrival: Arrival, deadline_us: float | None) -> Arrival:
-        deadline = self.due.of(deadline_us, arrival.received_ns)
+    def _due_by(self, arrival: Arrival, deadline_us: float | None, connection: Connection | None) -> Arrival:
+        answered_ns = 0 if connection is None else connection.answered_ns
+        deadline = self.due.of(deadline_us, arrival.received_ns, answered_ns)
         return arrival if deadline is None else Arrival(arrival.transport, arrival.received_ns, deadline)
 
     def _in_turn(self, asked: Asked) -> Answered:
         """Refuse at once, begin at once or, behind others and where this look has had its turn, in the line."""
-        refused = self._refused(asked, self.looks.backlog_us, is_new=asked.kind is not SubmitFeatures)
-        if refused is not None:
-            return refused
+        # Where nothing waits nobody gains by a refusal: then the bots fall back.
+        if not (self.looks.is_free and self._worker.is_idle):
+            refused = self._refused(asked, self.looks.backlog_us, is_new=asked.kind is not SubmitFeatures)
+            if refused is not None:
+                return refused
         if self.looks.is_free or (len(self.looks) == 0 and not self._is_quick(asked)):
             return self._begin(asked)
         if len(self.looks) + self._worker.n_waiting >= self._worker.max_queue:
@@ -186,6 +193,8 @@ class Desk:
         deadline = asked.arrival.deadline
         if asked.turn is not None:
             asked.pace.observe(asked.turn, took_us)
+        if asked.connection is not None:
+            asked.connection.answered_ns = self._clock()
         if deadline is None:
             return answered
         _note(asked, answered, took_us)

@@ -43,12 +43,15 @@ class Due:
         self._clock = clock
         self.n_refused = self.n_timed_out = self.n_late = 0
 
-    def of(self, asked_us: float | None, received_ns: int) -> Deadline | None:
-        """The deadline of a request, if it has any; one that is not legal is refused by the handlers."""
+    def of(self, asked_us: float | None, received_ns: int, answered_ns: int = 0) -> Deadline | None:
+        """The deadline of a request, if it has any; one that is not legal is refused by the handlers.
+
+        It came after `answered_ns`, when its connection was answered before.
+        """
         limit_us = self._default_us if asked_us is None else asked_us
         if limit_us is None or not 0.0 <= limit_us <= MAX_DEADLINE_US:
             return None
-        return Deadline(self._looks.since_ns(received_ns), limit_us, self._clock)
+        return Deadline(max(self._looks.since_ns(received_ns), answered_ns), limit_us, self._clock)
 
     def refusal_of(
         self, deadline: Deadline, wait_us: float, work_us: float, *, is_new: bool = False

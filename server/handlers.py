@@ -76,11 +76,6 @@ class Handlers:
         is_known = self.connections.peek(connection_id) is not None
         return (self.servings.max_body_bytes if is_known else self.servings.max_hello_bytes)[form]
 
-    def serving_of(self, connection_id: str | None) -> Serving | None:
-        """What this connection's bots are served, None where it is none; safe on the event loop."""
-        connection = self.connections.peek(connection_id)
-        return None if connection is None else connection.serving
-
     def steps(
         self, request: Request, connection_id: str | None, form: Format, deadline: Deadline | None = None
     ) -> Steps[Reply]:
@@ -125,7 +120,7 @@ class Handlers:
 
     def _hello(self, hello: Hello, connection_id: str | None, form: Format) -> Welcome:
         self.check_token(hello.token)
-        if connection_id is not None:
+        if self.connections.peek(connection_id) is not None:  # one that was silent for too long is over
             raise BadSchema("this socket has said hello already: it carries one connection")
         if hello.protocol != PROTOCOL_VERSION:
             raise BadSchema(f"protocol {hello.protocol} is not spoken here, expected {PROTOCOL_VERSION}")

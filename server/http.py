@@ -34,6 +34,7 @@ from server.worker import Worker
 __all__ = ["HttpDoor", "create_app"]
 
 _PIECE_BYTES = 65536
+_PROBES = ("/healthz", "/readyz")  # load balancers may ask by HEAD
 _BY_STATUS: dict[int, type[ProtocolError]] = {404: NoRoute, 405: MethodNotAllowed}
 
 
@@ -45,10 +46,12 @@ class HttpDoor:
         self._worker = worker
 
     async def bundle(self, request: Request) -> Response:
-        """What is served, without a connection; needs the token as `Authorization: Bearer` where there is one."""
+        """What is served, or of several what `?name=` says, without a connection; needs the token as
+        `Authorization: Bearer` where there is one."""
         try:
             check_bearer(self._handlers, request)
-            serving = await self._worker.run(partial(self._handlers.servings.named, None))
+            name = request.query_params.get("name")
+            serving = await self._worker.run(partial(self._handlers.servings.named, name))
         except ProtocolError as error:
             return _refused(error, Format.JSON)
         return Response(summary(serving.manifest), media_type=Format.JSON.value)
@@ -98,6 +101,8 @@ def create_app(door: HttpDoor, probes: Probes) -> FastAPI:
     views |= {"/healthz": probes.healthz, "/readyz": probes.readyz, "/metrics": probes.metrics}
     for path, view in views.items():
         app.add_api_route(path, view, methods=["GET"], response_class=Response)
+    for path in _PROBES:
+        app.add_api_route(path, views[path], methods=["HEAD"], response_class=Response, include_in_schema=False)
     app.add_exception_handler(HTTPException, door.not_served)
     app.add_exception_handler(Exception, _internal)
     document(app)

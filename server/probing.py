@@ -42,7 +42,7 @@ async def _look(servings: Servings, thread: ThreadPoolExecutor) -> None:
             if probe is None:
                 continue
             try:
-                took_us = await asyncio.get_running_loop().run_in_executor(thread, serving.bots.probe, probe.n_bots)
+                took_us = await asyncio.get_running_loop().run_in_executor(thread, serving.bots.probe, probe)
             except BadBundle:  # its graphs do not even answer in the right shape any more
                 took_us = float("inf")
             breaker.probed(took_us)

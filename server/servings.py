@@ -30,7 +30,7 @@ class Servings:
         self._active: dict[str, Serving] = {}
         self._loaded: list[Serving] = []
         self._max_bots = max_bots
-        self._max_loaded = max_loaded
+        self.max_loaded = max_loaded
         self.max_body_bytes = dict.fromkeys(Format, 0)
         self.max_hello_bytes = dict.fromkeys(Format, 0)
 
@@ -103,15 +103,17 @@ class Servings:
     def check_room(self, count: int) -> None:
         """Raise TooManyBots unless so many more bots may be started."""
         n_bots = self.n_bots
+        if count > self._max_bots:
+            raise TooManyBots(f"{count} bots never fit: there are {self._max_bots} slots")
         if n_bots + count > self._max_bots:
             raise TooManyBots(
                 f"{count} bots do not fit: {n_bots} of {self._max_bots} slots are taken", retry_after_s=_RETRY_AFTER_S
             )
 
     def _check_place(self) -> None:
-        if len(self._loaded) >= self._max_loaded:
+        if len(self._loaded) >= self.max_loaded:
             raise NotReady(
-                f"connections hold all {self._max_loaded} bundles that may be in memory", retry_after_s=_RETRY_AFTER_S
+                f"connections hold all {self.max_loaded} bundles that may be in memory", retry_after_s=_RETRY_AFTER_S
             )
 
     def _forget_unused(self, serving: Serving) -> None:

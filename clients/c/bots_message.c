@@ -140,7 +140,8 @@ static bots_status refused(bots_client *client, const uint8_t *const *found, con
     error->retry_after_s = retry_after_s;
     copy_printable(error->code, sizeof error->code, code.bytes, code.length);
     copy_printable(error->detail, MAX_DETAIL_CHARS + 1, detail.bytes, detail.length);
-    if (error->status == BOTS_NO_CONNECTION || error->status == BOTS_TOO_LARGE) { /* the server closes it too */
+    if (error->status == BOTS_NO_CONNECTION || error->status == BOTS_TOO_LARGE
+        || error->status == BOTS_TOO_MANY_CONNECTIONS) { /* the server closes it too, or answers nothing else on it */
         botsp_hang_up(&client->fd);
         client->is_welcome = 0;
     }

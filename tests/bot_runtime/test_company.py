@@ -40,14 +40,14 @@ def test_what_fits_is_what_allocate_leaves(shared: bool) -> None:
 def test_companies_come_and_go(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
     """Play in more orders than are remembered is play without any memory, byte for byte."""
     plays = []
-    for most in (1, 3, company_module.MAX_COMPANIES):
-        monkeypatch.setattr(company_module, "MAX_COMPANIES", most)
+    for times in (1, 3, company_module.ORDERS):
+        monkeypatch.setattr(company_module, "ORDERS", times)
         engine, orders = Engine(Bots(bundle, max_bots=6)), np.random.default_rng(1)
         handles, played = engine.bots.start(6, seeds=range(6)), []
         for frame in range(40):
             named = orders.permutation(handles)[: orders.integers(1, 7)] if frame % 3 else handles
             played += engine.play(named, range(frame, frame + 1))
-            assert len(engine.bots._companies._known) <= most
+            assert sum(each.n_bots for each in engine.bots._companies._known.values()) <= times * 6
         plays.append(played)
     assert plays[0] == plays[1] == plays[2]
 

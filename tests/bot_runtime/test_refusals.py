@@ -73,7 +73,8 @@ def refusals(
 def start_refusals(bots: Bots) -> list[tuple[type[Exception], str, Callable[[], object]]]:
     """Everything that can be refused to bots that are to start."""
     return [
-        (errors.TooManyBots, "slots are taken", lambda: bots.start(100)),
+        (errors.TooManyBots, "slots are taken", lambda: bots.start(8)),
+        (errors.TooManyBots, "never fit", lambda: bots.start(100)),
         (errors.BadSchema, "count is 0", lambda: bots.start(0)),
         (errors.BadShape, "seeds has 1", lambda: bots.start(2, seeds=[1])),
         (errors.OutOfRange, "seed of bot 0", lambda: bots.start(1, seeds=[-1])),

@@ -129,6 +129,9 @@ def test_what_the_server_refuses_says_why_and_changes_nothing(client: CClient) -
     assert client.turn("query", bots, 4, free=free).reasons == bytes(N)
     with pytest.raises(Refused, match="TOO_MANY_BOTS") as refusal:
         client.start(1000)
+    assert refusal.value.retry_after_s < 0, "no time will help"
+    with pytest.raises(Refused, match="TOO_MANY_BOTS") as refusal:
+        client.start(256)
     assert refusal.value.retry_after_s > 0
 
 

@@ -16,6 +16,10 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from protocol.client import BotClient
 from protocol.errors import BadBundle, NoBot, NoBundle
 from protocol.resuming import ResumingClient
+from server.catalogue import Catalogue
+from server.servings import Servings
+from server.store import Store
+from server.worker import Worker
 from tests.bundles import make_bundle, rehash
 from tests.server.serving import HttpAnswer, Served, http_request, play, same, serve
 
@@ -226,6 +230,15 @@ def test_connections_that_hold_on_to_old_versions_do_not_fill_the_memory(
             assert (code(refused), refused.headers["retry-after"]) == ((503, "NOT_READY"), "1")
             assert (listed(served)["tiny"]["active"], listed(served)["tiny"]["previous"]) == (1, 3)
         assert admin(served, "tiny/activate", {"version": 2}).status == 200
+
+
+def test_a_store_with_more_names_than_may_be_in_memory_is_not_opened(store: Path) -> None:
+    worker = Worker(max_queue=1)
+    try:
+        with pytest.raises(ValueError, match="--max-loaded is 1, and the store has more names"):
+            Catalogue(Store(store), Servings(8, max_loaded=1), worker, max_bots=8).open()
+    finally:
+        worker.close()
 
 
 def test_a_line_that_breaks_after_an_exchange_ends_its_bots_for_good(served: Served) -> None:

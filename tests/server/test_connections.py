@@ -12,6 +12,20 @@ from tests.server.serving import FakeClock
 COSTS = CostModel(0.0, (1.0,))
 
 
+def test_a_request_that_is_refused_breaks_the_silence_and_one_that_comes_too_late_does_not(serving: Serving) -> None:
+    clock = FakeClock()
+    connections = Connections(max_connections=3, idle_ttl_s=10.0, clock=clock)
+    talking, late = connections.open(COSTS, serving), connections.open(COSTS, serving)
+    clock.now += 9.0
+    assert connections.heard(talking.id) is talking
+    clock.now += 9.0
+    assert connections.heard(talking.id) is talking
+    for _ in range(2):
+        assert connections.heard(late.id) is None
+    assert connections.remove_silent() == [late]
+    assert connections.heard(None) is None
+
+
 def test_silence_is_measured_by_the_given_clock_and_any_request_breaks_it(serving: Serving) -> None:
     clock = FakeClock()
     connections = Connections(max_connections=3, idle_ttl_s=10.0, clock=clock)

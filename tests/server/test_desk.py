@@ -11,6 +11,8 @@ from pathlib import Path
 import msgpack
 import pytest
 
+from protocol.errors import NotReady
+from server.answer import Answer, Arrival
 from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE
 from tests.server.counter import Counter, run_at_desk
@@ -102,6 +104,42 @@ def test_only_small_turns_and_refusals_are_answered_on_the_loop(at_desk: Callabl
         )
         reply, inline = await counter.ask({"type": "hello", "token": "x" * 20000})
         assert (reply["code"], inline) == ("BAD_SCHEMA", False)
+
+    at_desk(test)
+
+
+def test_a_deadline_begins_no_earlier_than_its_connections_last_answer(
+    at_desk: Callable[..., None],
+) -> None:
+    async def test(counter: Counter) -> None:
+        bots = await counter.start(1)
+        assert [await counter.query(bots) for _ in range(2)] == [False, True]
+        counter.us = 300.0
+        await counter.look_again()
+        assert isinstance(counter.put(counter.request(bots, deadline_us=50_000.0)), Answer)
+        now, connection = Arrival("tcp", counter.now_ns), counter.desk.handlers.connections.peek(counter.connection)
+        assert connection is not None
+        own, others = (counter.desk._due_by(now, 1000.0, each).deadline for each in (connection, None))
+        assert connection.answered_ns == counter.now_ns
+        assert own.due_ns == counter.now_ns + 1_000_000
+        assert others.due_ns <= counter.now_ns + 700_000
+
+    at_desk(test)
+
+
+def test_where_nothing_waits_nobody_is_refused(at_desk: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test(counter: Counter) -> None:
+        bots, release = await counter.start(1), threading.Event()
+        assert [await counter.query(bots) for _ in range(2)] == [False, True]
+        monkeypatch.setattr(counter.desk.due, "refusal_of", lambda *_, **__: NotReady("no time", retry_after_s=0.1))
+        await counter.look_again()
+        reply, _ = await counter.ask(counter.request(bots, deadline_us=50_000.0))
+        assert reply["type"] == "queries"
+        holding = counter.worker.run(release.wait)
+        reply, _ = await counter.ask(counter.request(bots, deadline_us=50_000.0))
+        assert reply["code"] == "NOT_READY"
+        release.set()
+        await holding
 
     at_desk(test)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 import msgpack
@@ -172,9 +173,62 @@ def test_stream_sockets_are_limited(bundle: Path, tmp_path: Path) -> None:
     with serve(bundle, tmp_path / "s", max_connections=1) as served, BotClient(served.addresses["tcp"]) as first:
         first.hello()
         with RawStream(served.addresses["unix"]) as raw:
-            assert raw.reply()["code"] == "TOO_MANY_CONNECTIONS"
+            assert raw.frame(VECTORS["hello"].body)["code"] == "TOO_MANY_CONNECTIONS"
             assert raw.ended()
+        with RawStream(served.addresses["tcp"]) as raw:
+            assert raw.ended(), "who says nothing is not waited for"
+        for door in ("tcp", "unix"):
+            with BotClient(served.addresses[door]) as other:
+                for _ in range(3):
+                    with pytest.raises(TooManyConnections):
+                        other.hello()
         assert first.stop(first.start(1)) == 1
+        first.close()
+        with BotClient(served.addresses["unix"]) as other:
+            assert _until_welcome(other)
+
+
+def _until_welcome(client: BotClient) -> bool:
+    """The server may need a moment to notice that the last socket closed."""
+    for _ in range(2000):
+        with suppress(TooManyConnections):
+            return client.hello() is not None
+    return False
+
+
+def test_requests_that_are_refused_keep_a_connection_and_its_socket_outlives_one_that_has_ended(
+    bundle: Path, tmp_path: Path
+) -> None:
+    clock = FakeClock()
+    with serve(bundle, tmp_path / "s", clock, idle_ttl_s=60.0) as served, RawStream(served.addresses["tcp"]) as raw:
+        assert raw.frame(VECTORS["hello"].body)["type"] == "welcome"
+        bots = raw.frame(msgpack.packb({"type": "start_bots", "count": 1}))["bots"]
+        for _ in range(4):
+            clock.now += 40.0
+            assert raw.frame(msgpack.packb({"type": "stop_bots"}))["code"] == "BAD_SCHEMA"
+        assert raw.frame(VECTORS["hello"].body)["code"] == "BAD_SCHEMA"
+        assert raw.frame(msgpack.packb({"type": "stop_bots", "bots": bots}))["type"] == "bots_stopped"
+        clock.now += 61.0
+        assert raw.frame(msgpack.packb({"type": "start_bots", "count": 1}))["code"] == "NO_CONNECTION"
+        with BotClient(served.addresses["http"]) as other:
+            other.hello()  # sweeps
+        assert raw.frame(VECTORS["hello"].body)["type"] == "welcome"
+
+
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
+def test_a_client_may_say_hello_again(served: Served, door: str) -> None:
+    with BotClient(served.addresses[door]) as client:
+        first = client.hello().connection
+        client.start(1)
+        assert client.hello().connection != first
+        assert client.stop(client.start(1)) == 1
+
+
+def test_a_summary_may_be_asked_for_by_name(served: Served) -> None:
+    answers = [http_request(served.addresses["http"], "GET", f"/v1/bundle?name={name}") for name in ("tiny", "nope")]
+    assert [answer.status for answer in answers] == [200, 404]
+    assert json.loads(answers[0].body)["name"] == "tiny"
+    assert json.loads(answers[1].body)["code"] == "NO_BUNDLE"
 
 
 def test_a_silent_connection_ends_and_its_bots_with_it(bundle: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from protocol.client import BotClient
 from protocol.errors import NoBot
 from server import families
 from server.serving import Serving
-from tests.protocol.golden import TABLE
+from tests.protocol.golden import TABLE, VECTORS
 from tests.server.serving import RawStream, Served, costly_numbers, free_numbers, http_request, play, serve
 
 N = 3
@@ -129,13 +129,14 @@ def test_metrics_need_the_token(bundle: Path, tmp_path: Path) -> None:
         assert (scrape("bots"), scrape("connections")) == (0, 0)
         assert not any("s3cret" in str(sample) for sample in scrape.samples)
         for path in ("/healthz", "/readyz"):
+            assert http_request(guarded.addresses["http"], "HEAD", path).status == 200
             assert http_request(guarded.addresses["http"], "GET", path).status == 200
 
 
 def test_what_a_door_refuses_is_counted_too(bundle: Path, tmp_path: Path) -> None:
     with serve(bundle, tmp_path / "s", max_connections=1, token="s3cret") as server:
         with RawStream(server.addresses["tcp"]) as first, RawStream(server.addresses["unix"]) as second:
-            assert second.reply()["code"] == "TOO_MANY_CONNECTIONS"
+            assert second.frame(VECTORS["hello"].body)["code"] == "TOO_MANY_CONNECTIONS"
             first.socket.sendall(b"\x7f\xff\xff\xff")
             assert first.reply()["code"] == "TOO_LARGE"
         http = server.addresses["http"]

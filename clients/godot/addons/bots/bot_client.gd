@@ -18,6 +18,9 @@ const Requests = preload("requests.gd")
 const _LOOK_USEC := 20  # between two looks at the socket while a call waits; the system makes more of it
 const _FAREWELL_S := 0.5
 
+# After these nothing else is answered on the socket.
+const _ENDING := [Errors.CONNECTION_LOST, Errors.TIMED_OUT, Errors.BAD_REPLY, "NO_CONNECTION", "TOO_MANY_CONNECTIONS"]
+
 var timeout_s := 5.0
 var welcome = null  # what `hello` was answered; `welcome.table` is a feature_table.gd
 var n_late := 0  # replies that came too late by this clock, or left so by the server's
@@ -106,7 +109,7 @@ func poll():
 	_waiting_for = null
 	if came["ok"] and message["type"] != "connect":
 		came = _read(came["body"], message)
-	if not came["ok"] and came["code"] in [Errors.CONNECTION_LOST, Errors.TIMED_OUT, Errors.BAD_REPLY]:
+	if not came["ok"] and came["code"] in _ENDING:
 		drop()
 	return came
 
