@@ -78,6 +78,7 @@ def save_checkpoint(path: Path, config: TrainConfig, facts: Facts, state: TrainS
         "done": state.done,
         "penalty_weights": state.control.weights,
         "seconds": state.seconds,
+        "lengthened": state.lengthened,
     }
     if state.critics is not None and state.critic_optimiser is not None:
         data |= {"critics": state.critics.state_dict(), "critic_optimiser": state.critic_optimiser.state_dict()}
@@ -97,6 +98,9 @@ def load_checkpoint(path: Path, config: TrainConfig, state: TrainState, layout: 
             raise ValueError(
                 f"{path} was trained with {name} {getattr(theirs, name)}, this run has {value}: use another out"
             )
+    state.lengthened = data.get("lengthened", {})
+    if state.done and theirs.updates != config.updates:
+        state.lengthened[state.done] = theirs.updates
     if state.done > config.updates:
         raise ValueError(f"{path} is of update {state.done}, expected at most updates {config.updates}")
     if _layout(data) != (layout.features, layout.action, layout.feature_map):

@@ -6,7 +6,6 @@ own weight. This module knows nothing about evaluations.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -18,20 +17,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from training.config import TrainConfig
+from training.metrics import Line, read_metrics
 from training.results import Run
 
-__all__ = [
-    "PANELS",
-    "Line",
-    "budget_colours",
-    "draw_run",
-    "finish_panels",
-    "plot_curves",
-    "read_metrics",
-    "training_figure",
-]
+__all__ = ["PANELS", "budget_colours", "draw_run", "finish_panels", "plot_curves", "training_figure"]
 
-Line = Mapping[str, float]  # of metrics.jsonl
 PANELS = ("delta", "cost", "phi", "gamma")
 _TITLES = {"delta": "action loss Δ", "cost": "query cost, share of full", "phi": "penalty φ", "gamma": "weight γ"}
 _STRATUM_COST = "query cost / C"
@@ -49,17 +39,6 @@ def plot_curves(metrics: Path, out: Path, config: TrainConfig) -> None:
     draw_run(axes, read_metrics(metrics), config, colours, with_held_out=True)
     finish_panels(axes, [config])
     figure.savefig(out, dpi=100)
-
-
-def read_metrics(path: Path) -> list[Line]:
-    """One mapping a line. Raises ValueError naming the line that is no JSON."""
-    lines: list[Line] = []
-    for n, text in enumerate(path.read_text().splitlines(), start=1):
-        try:
-            lines.append(json.loads(text))
-        except ValueError as error:
-            raise ValueError(f"{path} line {n}: {error}") from error
-    return lines
 
 
 def budget_colours(budgets: Sequence[float]) -> dict[float, Any]:

@@ -13,7 +13,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from training.feature_map import FeatureMap, parts_of
+from protocol.features import FeatureTable
+from training.feature_map import FeatureMap, Parts, parts_of
 
 __all__ = ["Environment", "Outcome", "Paying", "open_environment"]
 
@@ -62,22 +63,46 @@ class Paying(Protocol):
         """`step` without acquiring anything."""
 
 
-def open_environment(name: str, owner_D: NDArray[np.int64], feature_map: FeatureMap | None = None) -> Environment:
-    """Make the environment with this gymnasium id; `owner_D` says which costly feature each costly number is of.
+def open_environment(name: str, features: FeatureTable, feature_map: FeatureMap | None = None) -> Environment:
+    """Make the environment with this gymnasium id, which must show these features, by this map if it has one.
 
-    Raises ValueError for an id that is not known, or whose module or simulator is not installed.
+    Raises ValueError for an id that is not known, whose module or simulator is not installed, or which shows others.
     """
     try:
         env = gymnasium.make(name)
     except (gymnasium.error.Error, ImportError) as error:
         raise ValueError(f"environment {name}: {error}") from error
+    _check_features(name, env.observation_space, features, feature_map)
     if feature_map is not None:
-        return _Mapped(env, owner_D, feature_map)
+        return _Mapped(env, features.owner, feature_map)
     bare = env.unwrapped
     # A time limit is a wrapper's: going around it would play longer episodes.
     if isinstance(bare, Paying) and env.spec is not None and env.spec.max_episode_steps is None:
         return _Paid(bare)
-    return _Whole(env, owner_D)
+    return _Whole(env, features.owner)
+
+
+def _check_features(
+    name: str, space: gymnasium.Space[Any], features: FeatureTable, feature_map: FeatureMap | None
+) -> None:
+    sizes = {key: part.shape[1] for key, part in _parts(space.sample()).items()}
+    if feature_map is None:
+        expected = {"free": features.n_free, "costly": features.n_costly}
+        if {key: sizes.get(key, 0) for key in expected} != expected:
+            raise ValueError(f"environment {name} shows {sizes} numbers, the bundle reads {expected}")
+        return
+    try:
+        shown = feature_map.table(sizes)
+    except ValueError as error:
+        raise ValueError(f"environment {name}: {error}") from error
+    if shown != features:
+        raise ValueError(f"environment {name} shows other features by the bundle's map than the bundle reads")
+
+
+def _parts(observation: Any) -> Parts:
+    """One observation as a feature map finds its parts."""
+    alone = {key: [part] for key, part in observation.items()} if isinstance(observation, dict) else [observation]
+    return parts_of(alone, 1)
 
 
 class _Paid:
@@ -138,8 +163,7 @@ class _Mapped(_Whole):
         super().restart(seed)
 
     def _split(self, observation: Any) -> dict[str, _Floats]:
-        alone = {key: [part] for key, part in observation.items()} if isinstance(observation, dict) else [observation]
-        free_1F, costly_1D = self._map.split(parts_of(alone, 1), self._chance)
+        free_1F, costly_1D = self._map.split(_parts(observation), self._chance)
         return {"free": free_1F[0], "costly": costly_1D[0]}
 
     def _action(self, action_A: _Floats) -> Any:

@@ -70,7 +70,7 @@ class Evaluation:
     budget: float  # hard cap of one bot; 1 is none
     return_mean: float
     return_std: float  # over episodes
-    return_stderr: float
+    return_stderr: float | None  # of the mean (None: one episode tells none)
     soft_cost_pct: float
     hard_cost_pct: float
     violations: int  # frames in which a bot passed its own budget, or all together the one that they share
@@ -93,9 +93,11 @@ def evaluate(config: EvaluateConfig) -> tuple[Evaluation, list[Episode]]:
     """Play `episodes` episodes in parallel processes, and write the heat map if one is asked for.
 
     The outcome depends neither on `workers` nor, without a frame budget, on `bots`. Raises BadBundle for a bundle that
-    does not verify, ValueError for a target cost that it cannot be asked for.
+    does not verify, ValueError for a target cost that it cannot be asked for or an environment of other features.
     """
     bundle = Bundle.load(config.bundle)
+    if (config.bundle / FEATURE_MAP).exists():
+        FeatureMap.read(config.bundle / FEATURE_MAP)  # a process that plays could not say what is wrong with it
     terms = _terms(config, bundle.manifest)
     groups = play_groups(terms, _groups(config), config.workers, bundle.name)
     episodes = sorted((episode for group in groups for episode in group.episodes), key=lambda episode: episode.seed)
@@ -155,7 +157,7 @@ def _summary(
         budget=terms.budget,
         return_mean=float(returns.mean()),
         return_std=float(returns.std()),
-        return_stderr=float(returns.std() / np.sqrt(len(returns))),
+        return_stderr=float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else None,
         soft_cost_pct=_frame_mean_pct(episodes, "soft_cost"),
         hard_cost_pct=_frame_mean_pct(episodes, "hard_cost"),
         violations=sum(played.violations for played in (*groups, *episodes)),

@@ -52,7 +52,7 @@ class HeatMap(NamedTuple):
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 arrays = [data[name] for name in cls._fields]
-        except (KeyError, EOFError, OSError, ValueError, BadZipFile, zlib.error) as error:
+        except (KeyError, TypeError, EOFError, OSError, ValueError, BadZipFile, zlib.error) as error:
             raise ValueError(f"{path} is no heat map, expected an .npz with {list(cls._fields)}: {error}") from error
         probs_TM, alive_T, costs_M, names = arrays
         if probs_TM.shape != (alive_T.size, costs_M.size) or names.shape != costs_M.shape:

@@ -105,8 +105,8 @@ class Player:
             1, seeds=[seed], target_returns=returns, budgets_us=[self._budget_us], target_costs_us=targets_us
         )
         if not self._idle:
-            owner_D = self._bundle.manifest.features.owner
-            self._idle.append(open_environment(self._terms.environment, owner_D, self._feature_map))
+            features = self._bundle.manifest.features
+            self._idle.append(open_environment(self._terms.environment, features, self._feature_map))
         return _Game(seed, handle, self._idle.pop())
 
     def _turn(

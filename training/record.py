@@ -17,6 +17,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from training.checkpoint import Facts, save_checkpoint
 from training.config import TrainConfig
+from training.metrics import parse_metrics
 from training.replace_file import replace_file
 from training.statistics import Statistics
 from training.update import TrainState
@@ -40,18 +41,26 @@ class RunRecord:
         self._lines = metrics.open("a+")
         try:
             fcntl.flock(self._lines, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._keep(metrics)
         except BlockingIOError as error:
             self._lines.close()
             raise ValueError(f"{config.out} is being trained by another process") from error
-        self._lines.seek(0)
-        whole = [line for line in self._lines if line.endswith("\n")]  # but for one that a kill or a full disk cut
-        kept = [line for line in whole if json.loads(line)["update"] <= state.done]  # the others will come again
-        self._lines.truncate(0)
-        self._lines.write("".join(kept))
+        except ValueError:
+            self._lines.close()
+            raise
         self._board = SummaryWriter(str(config.out), purge_step=state.done + 1)
         columns = (*Progress.get_default_columns()[:2], TimeElapsedColumn(), TimeRemainingColumn())
         self._progress = Progress(*columns, TextColumn("{task.fields[now]}"))
         self._task = self._progress.add_task(config.name, total=config.updates, completed=state.done, now="")
+
+    def _keep(self, metrics: Path) -> None:
+        """Drop what will come again, and a line that a kill or a full disk cut."""
+        self._lines.seek(0)
+        whole = [line for line in self._lines if line.endswith("\n")]
+        told = zip(whole, parse_metrics(metrics, whole), strict=True)
+        kept = [text for text, line in told if line["update"] <= self._state.done]
+        self._lines.truncate(0)
+        self._lines.write("".join(kept))
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -87,8 +96,9 @@ class RunRecord:
         self._progress.update(self._task, now=now)
 
 
-def write_versions(path: Path, statistics: Statistics, workers: int) -> None:
-    """What made a run: versions of the libraries, threads, and how much was read."""
+def write_versions(path: Path, statistics: Statistics, workers: int, lengthened: dict[int, int]) -> None:
+    """What made a run: versions of the libraries, threads, how much was read, and what config.json does not tell: at
+    which updates it was given another number of them, which changes the course of the learning rate."""
     libraries = ("torch", "onnx", "onnxruntime", "numpy", "minari", "pyarrow")
     versions = {name: importlib.metadata.version(name) for name in libraries}
     versions |= {
@@ -99,4 +109,6 @@ def write_versions(path: Path, statistics: Statistics, workers: int) -> None:
         "episodes": str(statistics.n_episodes),
         "steps": str(statistics.n_steps),
     }
+    if lengthened:
+        versions["lengthened"] = ", ".join(f"after update {done} of {before}" for done, before in lengthened.items())
     replace_file(path, (json.dumps(versions, indent=2) + "\n").encode())

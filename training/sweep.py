@@ -33,7 +33,7 @@ from training.sweep_spec import SweepSpec
 
 __all__ = ["Outcome", "SweepConfig", "main", "sweep"]
 
-_PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "minari", "gymnasium")
+_PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "minari", "gymnasium", "mujoco", "pybullet")
 _POLL_S = 1.0
 _STOP_S = 30.0  # for Ray's tasks to end the processes that they started
 _FILE_COLUMNS = 160  # of what is not written to a terminal: one line a run, to be searched

@@ -99,7 +99,7 @@ def _draw_held_out(config: TrainConfig, held_out: TraceSource) -> Drawn | None:
 def _begin_record(config: TrainConfig, state: TrainState, traces: TraceSource, held_out: Drawn | None) -> RunRecord:
     config.out.mkdir(parents=True, exist_ok=True)
     config.write(config.out / "config.json")
-    write_versions(config.out / "versions.json", traces.statistics, workers.count())
+    write_versions(config.out / "versions.json", traces.statistics, workers.count(), state.lengthened)
     forward = Pass(config, state.model, feature_costs(config, traces))
 
     def measure() -> dict[str, float]:

@@ -44,6 +44,7 @@ class TrainState:
     critic_optimiser: torch.optim.Adam | None = None
     done: int = 0  # updates made
     seconds: float = 0.0  # spent training, resumed runs included
+    lengthened: dict[int, int] = field(default_factory=dict)  # after so many updates: how many the run had till then
     metrics: dict[str, float] = field(default_factory=dict)
 
 

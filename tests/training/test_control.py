@@ -68,6 +68,19 @@ def test_each_stratum_has_its_own_weight_and_padding_is_not_spent() -> None:
     assert added.item() == pytest.approx(0.4 / 5)
 
 
+def test_dual_counts_neither_what_padding_spends_nor_what_it_may() -> None:
+    """Without it the first row asks for exactly its C; with what it asks for, or may, past its end it would not."""
+    control = Control("dual", 0.01, -0.1, [2.0])
+    cost, valid = torch.tensor([[0.5, 0.9]]), torch.tensor([[1.0, 0.0]])
+    control.observe(cost, torch.tensor([0.5]), torch.tensor([0]), valid)
+    assert control.weights == pytest.approx([2.0])
+
+
+def test_target_costs_are_spread_evenly_over_orders_of_magnitude() -> None:
+    costs, _ = draw_costs((0.01, 1.0), 20_000, np.random.default_rng(0))
+    assert np.quantile(np.log10(costs), [0.25, 0.5, 0.75]) == pytest.approx([-1.5, -1.0, -0.5], abs=0.05)
+
+
 def test_dual_penalty_is_the_signed_excess_of_the_mean() -> None:
     control = Control("dual", 0.01, -0.1, [2.0, 10.0])
     cost, target = torch.tensor([[0.2, 0.4], [0.0, 0.0]]), torch.tensor([0.1, 0.05])

@@ -126,8 +126,8 @@ def test_a_bundle_of_another_environment_is_played_through_the_runtime(cartpole:
 
 
 def test_what_is_played_has_noise_that_follows_the_episode() -> None:
-    owner_D = MAP.table({"": 4}).owner
-    first, second = open_environment(CARTPOLE, owner_D, MAP), open_environment(CARTPOLE, owner_D, MAP)
+    features = MAP.table({"": 4})
+    first, second = open_environment(CARTPOLE, features, MAP), open_environment(CARTPOLE, features, MAP)
     asked = np.array([True, True])
     for env in (first, second):
         env.restart(5)

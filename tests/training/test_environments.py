@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from game.env import feature_table
+from protocol.features import FeatureTable
 from tests.bundles import FEATURES
 from tests.training.line import LINE, TIME_LIMIT, TIMED_LINE
 from training.environments import Environment, Paying, _Whole, open_environment
@@ -16,8 +17,8 @@ NAVIGATION = "game.env:Navigation-hard-v0"
 
 
 def test_paying_for_each_ray_changes_nothing_that_is_seen() -> None:
-    owner_D = feature_table().owner
-    paid, whole = open_environment(NAVIGATION, owner_D), _Whole(gymnasium.make(NAVIGATION), owner_D)
+    features = feature_table()
+    paid, whole = open_environment(NAVIGATION, features), _Whole(gymnasium.make(NAVIGATION), features.owner)
     assert not isinstance(paid, _Whole)
     random = np.random.default_rng(0)
     for env in (paid, whole):
@@ -35,7 +36,7 @@ def test_paying_for_each_ray_changes_nothing_that_is_seen() -> None:
 
 
 def test_any_environment_hands_on_only_what_was_asked_for() -> None:
-    env: Environment = open_environment(LINE, FEATURES.owner)
+    env: Environment = open_environment(LINE, FEATURES)
     env.restart(3)
     nothing, all_of_it = np.zeros(FEATURES.n_queries, dtype=bool), np.ones(FEATURES.n_queries, dtype=bool)
     assert not env.acquire(nothing).any()
@@ -45,7 +46,7 @@ def test_any_environment_hands_on_only_what_was_asked_for() -> None:
 
 
 def test_a_time_limit_is_kept() -> None:
-    env = open_environment(TIMED_LINE, FEATURES.owner)
+    env = open_environment(TIMED_LINE, FEATURES)
     env.restart(3)
     outcomes = [env.advance(np.zeros(3, dtype=np.float32)) for _ in range(TIME_LIMIT)]
     assert [outcome.truncated for outcome in outcomes] == [False, True]
@@ -54,7 +55,7 @@ def test_a_time_limit_is_kept() -> None:
 def test_an_environment_that_pays_with_a_time_limit_is_played_through_its_wrapper() -> None:
     if "Limited-navigation-v0" not in gymnasium.registry:
         gymnasium.register("Limited-navigation-v0", "game.env:NavigationEnv", max_episode_steps=TIME_LIMIT)
-    env = open_environment("Limited-navigation-v0", feature_table().owner)
+    env = open_environment("Limited-navigation-v0", feature_table())
     assert isinstance(gymnasium.make("Limited-navigation-v0").unwrapped, Paying)
     env.restart(0)
     for _ in range(TIME_LIMIT):
@@ -65,8 +66,8 @@ def test_an_environment_that_pays_with_a_time_limit_is_played_through_its_wrappe
 @pytest.mark.parametrize("name", ["free", "acquire", "restart", "advance"])
 def test_both_offer_the_same_calls(name: str) -> None:
     for environment in (NAVIGATION, LINE):
-        owner_D = feature_table().owner if environment == NAVIGATION else FEATURES.owner
-        assert callable(getattr(open_environment(environment, owner_D), name))
+        features = feature_table() if environment == NAVIGATION else FEATURES
+        assert callable(getattr(open_environment(environment, features), name))
 
 
 class Whole(gymnasium.Env):
@@ -87,7 +88,8 @@ class Whole(gymnasium.Env):
 
 def test_an_environment_of_whole_numbers_gets_whole_numbers() -> None:
     gymnasium.register("Whole-v0", lambda: Whole(), disable_env_checker=True)
-    env = open_environment("Whole-v0", np.zeros(2, dtype=np.int64), FeatureMap((MappedFeature("last", key="last"),)))
+    last = FeatureMap((MappedFeature("last", key="last"),))
+    env = open_environment("Whole-v0", last.table({"last": 2}), last)
     env.restart(0)
     env.advance(np.array([1.6, -2.2], dtype=np.float32))
     assert env.free().tolist() == [2.0, -2.0]
@@ -96,4 +98,27 @@ def test_an_environment_of_whole_numbers_gets_whole_numbers() -> None:
 @pytest.mark.parametrize("name", ["Nope-v0", "no_such_module:Nope-v0", "not an id"])
 def test_an_environment_that_cannot_be_made_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=f"environment {name}: "):
-        open_environment(name, FEATURES.owner)
+        open_environment(name, FEATURES)
+
+
+POLE = FeatureMap((MappedFeature("place", (0,)), MappedFeature("speed", (1,), cost_us=1.0)))
+
+
+@pytest.mark.parametrize(
+    ("feature_map", "features", "said"),
+    [
+        (None, FEATURES, r"environment CartPole-v1 shows .'': 4. numbers, the bundle reads .'free': "),
+        (
+            FeatureMap((MappedFeature("far", (9,)),)),
+            FEATURES,
+            "environment CartPole-v1: feature far has number 9, the observation has 0 to 3",
+        ),
+        (POLE, FEATURES, "environment CartPole-v1 shows other features by the bundle's map"),
+    ],
+    ids=["no-map", "map-of-another", "another-bundle"],
+)
+def test_an_environment_of_other_features_is_refused(
+    feature_map: FeatureMap | None, features: FeatureTable, said: str
+) -> None:
+    with pytest.raises(ValueError, match=said):
+        open_environment("CartPole-v1", features, feature_map)

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -16,8 +17,9 @@ import pytest
 from game.env import ACTION_SPEC, feature_table
 from tests.bundles import make_bundle
 from tests.training.line import LINE
-from training.evaluate import EvaluateConfig, _normalised, evaluate, main
+from training.evaluate import EvaluateConfig, _frame_mean_pct, _normalised, evaluate, main
 from training.heat_map import HeatMap
+from training.play import Episode
 
 ENVIRONMENT = "game.env:Navigation-hard-v0"
 
@@ -158,6 +160,27 @@ def test_an_evaluation_that_is_stopped_stops_with_all_that_play(number: signal.S
         said += running.communicate(timeout=60)[1]
     assert running.returncode == {signal.SIGINT: 1, signal.SIGTERM: 143, signal.SIGKILL: -9}[number]
     assert b"Traceback" not in said
+
+
+def test_a_cost_is_a_mean_over_frames_and_not_over_episodes() -> None:
+    short = Episode(seed=0, total=1.0, frames=1, soft_cost=1.0, hard_cost=0.5, violations=0, terminated=True)
+    long = dataclasses.replace(short, seed=1, frames=9, soft_cost=0.0, hard_cost=0.0)
+    assert _frame_mean_pct([short, long], "soft_cost") == pytest.approx(10.0)
+    assert _frame_mean_pct([short, long], "hard_cost") == pytest.approx(5.0)
+
+
+def test_a_standard_error_is_that_of_a_sample(tiny: Path) -> None:
+    evaluation, episodes = evaluate(EvaluateConfig(tiny, LINE, episodes=5, workers=1))
+    assert evaluation.return_stderr == pytest.approx(statistics.stdev(one.total for one in episodes) / 5**0.5)
+    assert evaluate(EvaluateConfig(tiny, LINE, episodes=1, workers=1))[0].return_stderr is None
+
+
+def test_a_broken_feature_map_is_named(tiny: Path, tmp_path: Path) -> None:
+    bundle = tmp_path / "tiny"
+    shutil.copytree(tiny, bundle)
+    (bundle / "feature_map.json").write_text('{"features": [')
+    with pytest.raises(ValueError, match=r"feature_map\.json: Input data was truncated"):
+        evaluate(EvaluateConfig(bundle, LINE, episodes=1, workers=1))
 
 
 def test_d4rls_score_is_0_and_100_at_its_references() -> None:

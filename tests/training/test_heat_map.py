@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,9 @@ def test_refuses_what_is_no_heat_map(tmp_path: Path) -> None:
     heat = counted([np.full((4, N_QUERIES), 0.25)]).mean(COSTS, NAMES)
     heat.write(path)
     whole = path.read_bytes()
-    for broken in (whole[: len(whole) // 2], whole.replace(whole[60:70], bytes(10))):
+    numbers = io.BytesIO()
+    np.save(numbers, heat.probs_TM)
+    for broken in (whole[: len(whole) // 2], whole.replace(whole[60:70], bytes(10)), numbers.getvalue()):
         path.write_bytes(broken)
         with pytest.raises(ValueError, match="is no heat map, expected"):
             HeatMap.read(path)

@@ -67,6 +67,22 @@ def test_value_is_drawn_to_the_upper_end_of_the_lesser_q() -> None:
     assert critics.weights(state, action).flatten().tolist() == pytest.approx((3.0 * gap).exp().flatten().tolist())
 
 
+def test_q_is_drawn_to_what_follows_and_slow_copies_judge() -> None:
+    """Eq. 6 there moves no V; V and the weights read the slow copies, which follow by a twentieth."""
+    torch.manual_seed(0)
+    episodes = chain(4)
+    critics = Critics(4, 1, reward_scale=1.0)
+    critics(*episodes)[1].backward()
+    assert all(parameter.grad is None or not parameter.grad.any() for parameter in critics.value.parameters())
+    judged, slow = critics.weights(*episodes[:2]), critics.target_q[0][-1].bias.clone()
+    with torch.no_grad():
+        for q in critics.q:
+            q[-1].bias += 5.0
+    assert torch.equal(critics.weights(*episodes[:2]), judged)
+    critics.follow()
+    assert critics.target_q[0][-1].bias.item() == pytest.approx(slow.item() + 0.25, rel=1e-4)
+
+
 def test_a_windows_last_timestep_without_successor_teaches_q_nothing() -> None:
     torch.manual_seed(0)
     state, action, togo, last, valid = chain(4)

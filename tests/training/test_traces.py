@@ -70,6 +70,9 @@ def test_an_episodes_ends_are_met_half_as_often_as_its_middle(dataset: Path) -> 
     assert met[0] == pytest.approx(3 / 20, rel=0.2)
     assert met[1:16] == pytest.approx(np.full(15, 1 / 20), rel=0.2)
     assert met[16] == pytest.approx(2 / 20, rel=0.2)
+    met = np.bincount(windows.length_B, minlength=30)[8:]
+    there = np.bincount(load_traces(dataset).lengths_E, minlength=30)[8:]
+    assert met / len(windows.length_B) == pytest.approx(there * np.arange(8, 30) / (there @ np.arange(8, 30)), abs=0.01)
 
 
 def test_held_out_episodes_are_never_drawn(dataset: Path) -> None:

@@ -13,6 +13,7 @@ import torch
 from tests.training import toy
 from training.config import TrainConfig
 from training.draws import draw_share
+from training.iql import Critics
 from training.objectives import query_cost
 from training.traces import Traces, choose_windows, load_traces
 from training.update import TrainState, learning_rate, new_state, update
@@ -60,6 +61,22 @@ def test_a_window_that_burns_in_pays_for_every_query_as_much_as_those_that_count
     (plain, whole), (burnt, share) = paid(0), paid(5)
     assert whole == 1.0 > share
     assert burnt.tolist() == pytest.approx((plain / share).tolist(), rel=1e-3)
+
+
+def test_iql_imitates_an_action_as_much_as_it_is_worth(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, traces = toy.config(dataset, tmp_path, method="iql"), load_traces(dataset)
+
+    def updated(worth: float) -> TrainState:
+        monkeypatch.setattr(Critics, "weights", lambda *_: torch.full((config.batch, config.window), worth))
+        return _updated(config, traces)
+
+    nothing, once, thrice = updated(0.0), updated(1.0), updated(3.0)
+    assert nothing.metrics["delta"] == 0.0
+    assert nothing.model.action_head.weight.grad.abs().max() == 0.0
+    assert once.metrics["delta"] > 0.0
+    assert thrice.metrics["delta"] == pytest.approx(3.0 * once.metrics["delta"])
 
 
 def test_a_gradient_is_clipped_to_its_norm(dataset: Path, tmp_path: Path) -> None:
