@@ -120,7 +120,7 @@ class Handlers:
 
     def _hello(self, hello: Hello, connection_id: str | None, form: Format) -> Welcome:
         self.check_token(hello.token)
-        if self.connections.peek(connection_id) is not None:  # one that was silent for too long is over
+        if self.connections.heard(connection_id) is not None:  # one that was silent for too long is over
             raise BadSchema("this socket has said hello already: it carries one connection")
         if hello.protocol != PROTOCOL_VERSION:
             raise BadSchema(f"protocol {hello.protocol} is not spoken here, expected {PROTOCOL_VERSION}")
