@@ -25,8 +25,8 @@ if TYPE_CHECKING:  # a turn is a company's, and a company remembers its last tur
 __all__ = ["ORDERS", "Companies", "Company", "Means"]
 
 ORDERS = 4
-"""Of all bots that there may be, so many times over in companies: each bot of one takes some kB. An engine that names
-its bots in ever new orders pushes out the oldest."""
+"""Of all bots that there may be, so many times over in companies, of which there are as many as bots: one takes 40 kB
+and each bot of it another two. An engine that names its bots in ever new orders pushes out the oldest."""
 # What stays this far below a budget needs no allocation, for allocation keeps back less than that of it.
 _AMPLE = 1.0 - 1e-6
 _Floats = NDArray[np.float64]
@@ -127,7 +127,7 @@ class Companies:
         means = Means.of(self._spending.terms(slots_N, unsaid))
         company = Company(handles_N.copy(), self._contexts.batch(slots_N), means)
         self._n_bots += company.n_bots
-        while self._n_bots > ORDERS * self._slots.capacity:
+        while self._n_bots > ORDERS * self._slots.capacity or len(self._known) == self._slots.capacity:
             self._n_bots -= self._known.pop(next(iter(self._known))).n_bots
         self._known[key] = company
         return company
