@@ -14,6 +14,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import sys
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -32,6 +33,7 @@ from game.env import ACTION_SPEC, NavigationEnv
 from game.players import Kicks, Player
 from game.recording import Episode, Summary, merge_shards, summarise, write_shard
 from game.skills import EXPERT, GROUNDED, INTERMEDIATE, NEARSIGHTED, Skill
+from game.terrain import MapError
 
 __all__ = ["Collect", "collect", "dataset_id", "play_episode"]
 
@@ -53,6 +55,8 @@ class Collect:
     sight_m: float | None = None  # how far the player recognises bridges and pools (None: as its skill says)
 
     def __post_init__(self) -> None:
+        if self.episodes < 1 or self.workers < 1:
+            raise ValueError(f"episodes is {self.episodes} and workers {self.workers}, expected 1 or more of both")
         if self.sight_m is not None and not self.sight_m > 0.0:
             raise ValueError(f"sight_m is {self.sight_m}, expected above 0 m")
 
@@ -68,7 +72,10 @@ def main() -> None:
     config = tyro.cli(Collect, description=__doc__)
     console = Console()
     begun = time.perf_counter()
-    folder, summary = collect(config, console)
+    try:
+        folder, summary = collect(config, console)
+    except (MapError, OSError) as error:
+        sys.exit(f"error: {error}")
     wall_s = time.perf_counter() - begun
     megabytes = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
     returns, lengths = np.array(summary.returns), np.array(summary.lengths)

@@ -122,7 +122,7 @@ class BotClient:
         add_numbers(message, "target_costs_us", target_costs_us)
         if turns is not None:
             message["turns"] = [int(taken) for taken in turns]
-        handles_N, self._welcome = read_bots_started(self.exchange(message), self.welcome)
+        handles_N, self._welcome = read_bots_started(self.exchange(message), self.welcome, int(count))
         return handles_N
 
     def query(
@@ -239,7 +239,7 @@ class BotClient:
         body = self._transport.exchange(message["type"], self._packer.pack(message), connection)
         try:
             return read_reply(body, message["type"])
-        except (NoConnection, TooManyConnections):  # nothing will be answered on this socket but goodbye
+        except (NoConnection, TooManyConnections, ReplyError):  # nothing sensible will be answered on this socket
             self._transport.close()
             raise
 

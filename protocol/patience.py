@@ -35,7 +35,8 @@ class Patience:
         """The answer to `first`, or to `again` after `resume` has opened another connection.
 
         A request without an answer is sent again as it is: where the connection lives, that changes nothing unless it
-        is not `repeatable`, and where it does not, the server says so. `close` ends what `resume` half made.
+        is not `repeatable`, and where it does not, the server says so. `close` ends what `resume` half made, and what a
+        request that is not repeatable may have.
         """
         attempt, lost, give_up_s, pause_s = first, False, float("inf"), _FIRST_PAUSE_S
         while True:
@@ -48,8 +49,8 @@ class Patience:
                 if isinstance(error, _BUSY) and give_up_s == float("inf"):
                     raise
                 failure = error
-            if lost:
-                close()
+            if lost or not (repeatable or isinstance(failure, _BUSY)):
+                close()  # of what may have begun nobody heard: it must not stand in the way of what is begun instead
             lost = lost or not repeatable or isinstance(failure, NoConnection)
             now_s = self._clock()
             give_up_s = min(give_up_s, now_s + self._limit_s)

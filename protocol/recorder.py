@@ -93,8 +93,9 @@ class Recorder:
 
         Raises BadSchema, BadShape, NonFinite, OutOfRange, StaleFrame, TooManyBots and TooLarge; nothing has changed
         then, and rewards that were to be recorded belong in the bots' next record. Raises OSError where the record
-        could not be written, on a full disk for one: the file ends with the record before, and the recorder is closed,
-        so that no episode has a hole. Raises RecordingError when closed.
+        could not be written, on a full disk for one: the file ends with the record before, or with this one where it
+        could only not be synced, and the recorder is closed, so that no episode has a hole. Raises RecordingError when
+        closed.
         """
         if self._file.closed:
             raise RecordingError(f"{self.path}: the recorder is closed")

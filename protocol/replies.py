@@ -143,10 +143,11 @@ def _float(number: Any) -> float | None:
     return None if number is None else float(number)
 
 
-def read_bots_started(reply: dict[str, Any], welcome: Welcome) -> tuple[NDArray[np.int64], Welcome]:
-    """The handles of a `bots_started`, and `welcome` with the version that these bots are of; raises ReplyError."""
+def read_bots_started(reply: dict[str, Any], welcome: Welcome, count: int) -> tuple[NDArray[np.int64], Welcome]:
+    """The handles of a `bots_started` for so many, and `welcome` with the version that these bots are of; raises
+    ReplyError."""
     try:
-        return np.array(reply["bots"], dtype=np.int64), welcome._replace(**_read_version(reply))
+        return np.array(reply["bots"], dtype=np.int64).reshape(count), welcome._replace(**_read_version(reply))
     except _FAULTS as error:
         raise _unreadable("start_bots", error) from error
 

@@ -59,6 +59,7 @@ class ResumingClient:
         self._patience = Patience(limit_s, clock, sleep)
         self._said: dict[str, Any] | None = None
         self._welcome: Welcome | None = None
+        self._is_held = False  # to the version of bots that were resumed
         self._history = History(1)
         self._names = Names()
         self._turns = Answers()
@@ -89,7 +90,7 @@ class ResumingClient:
         self._welcome = self._client.hello(**said)  # type: ignore[arg-type]
         if self._welcome.replay_frames is None:
             raise ReplyError("this server cannot resume bots: it is older than this client")
-        self._said, self._history = said, History(self._welcome.replay_frames)
+        self._said, self._history, self._is_held = said, History(self._welcome.replay_frames), False
         self._names.now, self._turns = {}, Answers()
         return self._welcome
 
@@ -111,6 +112,8 @@ class ResumingClient:
         def start() -> NDArray[np.int64]:
             return self._client.start(count, seeds=drawn, **limits)
 
+        if self._is_held and not self._history.bots:
+            self._client.close()  # the next connection is to whatever is active
         handles_N = self._through(start, start, repeatable=False)
         self._welcome = self._client.welcome
         numbers = self._names.add(handles_N)
@@ -254,15 +257,20 @@ class ResumingClient:
         return self._patience.answer(first, again, resume, self._client.close, repeatable=repeatable)
 
     def _resume(self, said: dict[str, Any]) -> None:
-        """A new connection with the same bots, their contexts rebuilt. Raises what BotClient does; NoBot."""
-        was = self.welcome
-        if was.bundle_version is not None:
+        """A new connection with the same bots, their contexts rebuilt. Raises what BotClient does; NoBot.
+
+        Bots can only be rebuilt on the version that they began on; where there are none, any that keeps its promises
+        will do.
+        """
+        was, self._is_held = self.welcome, bool(self._history.bots)
+        if self._is_held and was.bundle_version is not None:
             said = {**said, "bundle": f"{was.bundle}@{was.bundle_version}"}
         try:
             welcome = self._client.hello(**said)
         except NoBundle as error:  # another version was activated, and this line was the last to hold the old one
             raise NoBot("another version is served now: the bots cannot be resumed") from error
-        if welcome.bundle_sha256 != was.bundle_sha256 or welcome.features != was.features:
+        is_same = welcome.bundle_sha256 == was.bundle_sha256 or not self._is_held
+        if not is_same or (welcome.features, welcome.action) != (was.features, was.action):
             raise NoBot("another bundle is served now: the bots cannot be resumed")
         self._names.now = rebuild(self._client, self._history)
         self._welcome = self._client.welcome

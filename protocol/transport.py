@@ -138,7 +138,7 @@ class HttpTransport:
                 self._socket = self._dial()
             self._socket.sendall(b"%b%d%b\r\n\r\n%b" % (self._heads[kind], len(body), named, body))
             reply, is_kept = _read_http(self._socket)
-        except OSError:
+        except BaseException:  # an interrupt too: its answer would be read as that to the next request
             self.close()
             raise
         if not is_kept:
@@ -160,7 +160,7 @@ class StreamTransport:
                 self._socket = self._dial()
             self._socket.sendall(_PREFIX.pack(len(body)) + body)
             return _read_frame(self._socket)
-        except OSError:
+        except BaseException:  # an interrupt too: its answer would be read as that to the next request
             self.close()
             raise
 

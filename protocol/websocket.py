@@ -41,7 +41,7 @@ class WebSocketTransport:
             while not self._messages:
                 self._receive(opened)
             return self._messages.popleft()
-        except OSError:
+        except BaseException:  # an interrupt too: its answer would be read as that to the next request
             self.close()
             raise
 

@@ -117,13 +117,10 @@ class Connections:
         """Forget a connection, and return it if there was one."""
         return self._by_id.pop(connection_id, None)
 
-    def remove_silent(self) -> list[Connection]:
-        """Forget every connection that has been silent for longer than the TTL, and return them."""
+    def silent(self) -> list[Connection]:
+        """Every connection that has been silent for longer than the TTL."""
         now_s = self._clock()
-        silent = [each for each in self._by_id.values() if self._is_silent(each, now_s)]
-        for connection in silent:
-            del self._by_id[connection.id]
-        return silent
+        return [each for each in self._by_id.values() if self._is_silent(each, now_s)]
 
     def _is_silent(self, connection: Connection, now_s: float) -> bool:
         return now_s - connection.last_seen_s > self._idle_ttl_s

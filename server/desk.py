@@ -175,8 +175,10 @@ class Desk:
             answered = self._worker.run(partial(self._answered_there, asked, self._clock()), asked.work_us)
         except NotReady as error:
             return self._refuse(asked, error)
-        deadline = asked.arrival.deadline
-        return answered if deadline is None else self.due.watched(deadline, answered, asked.form)
+        if asked.arrival.deadline is not None:
+            answered = self.due.watched(asked.arrival.deadline, answered, asked.form)
+        answered.add_done_callback(lambda _: self._answered(asked))
+        return answered
 
     def _is_quick(self, asked: Asked) -> bool:
         return asked.turn is not None and self._worker.is_idle and asked.pace.expected_us(asked.turn) <= self._inline_us
@@ -193,12 +195,16 @@ class Desk:
         deadline = asked.arrival.deadline
         if asked.turn is not None:
             asked.pace.observe(asked.turn, took_us)
-        if asked.connection is not None:
-            asked.connection.answered_ns = self._clock()
+        self._answered(asked)
         if deadline is None:
             return answered
         _note(asked, answered, took_us)
         return self.due.kept(deadline, answered, asked.form)
+
+    def _answered(self, asked: Asked) -> None:
+        """What this connection asks next it asks from now on."""
+        if asked.connection is not None:
+            asked.connection.answered_ns = self._clock()
 
     def _answered_there(self, asked: Asked, put_ns: int) -> Answer:
         """On the worker's thread. The whole of it is from the last one's end, or from when it was put there."""
@@ -220,6 +226,7 @@ class Desk:
 
     def _refuse(self, asked: Asked, error: NotReady) -> Answer:
         self.handlers.recorder.refused(asked.arrival.transport, error.code)
+        self._answered(asked)
         return refusal(error, asked.form)
 
 

@@ -106,8 +106,8 @@ class Handlers:
 
     def end_silent(self) -> None:
         """End every connection that has been silent for longer than its time to live."""
-        for connection in self.connections.remove_silent():
-            self._let_go(connection, "silence")
+        for connection in self.connections.silent():
+            self.end(connection.id, "silence")
 
     def costs(self) -> list[Report]:
         """What acquiring costs each connection's engine, in the order in which they connected."""
@@ -127,10 +127,14 @@ class Handlers:
         serving = self.servings.named(hello.bundle)
         cost_model = hello.cost_model or CostModel.declared(serving.table)
         check_costs(cost_model, serving.table)
-        self.end_silent()
         is_pinned = hello.bundle is not None and "@" in hello.bundle
-        connection = self.connections.open(cost_model, serving, is_pinned=is_pinned)
-        self.servings.hold(serving)
+        self.servings.hold(serving)  # first: the last connection that held it may be among those that are silent
+        try:
+            self.end_silent()
+            connection = self.connections.open(cost_model, serving, is_pinned=is_pinned)
+        except BaseException:
+            self.servings.release(serving)
+            raise
         welcome = serving.welcome(connection.id, cost_model, connection.costs.quantile, form)
         return replace(welcome, deadline_us=self._default_deadline_us)
 

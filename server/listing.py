@@ -66,7 +66,7 @@ def in_memory(servings: Servings) -> _Loaded:
             "active" if servings.active(serving.name) is serving else "held",
             serving.sha256,
             bundle.signed_by,
-            bundle.manifest.provenance.get("precision", "float32"),
+            bundle.manifest.precision,
             serving.n_connections,
             serving.bots.n_bots,
         )

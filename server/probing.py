@@ -11,7 +11,6 @@ from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 
-from protocol.errors import BadBundle
 from server.servings import Servings
 
 __all__ = ["probing"]
@@ -43,7 +42,8 @@ async def _look(servings: Servings, thread: ThreadPoolExecutor) -> None:
                 continue
             try:
                 took_us = await asyncio.get_running_loop().run_in_executor(thread, serving.bots.probe, probe)
-            except BadBundle:  # its graphs do not even answer in the right shape any more
+            except Exception:  # whatever it is, the bundle does not work, and others want to be probed too
+                _log.exception("a probe of %s failed", serving.name)
                 took_us = float("inf")
             breaker.probed(took_us)
             state = "open" if breaker.is_open else "closed"

@@ -1,4 +1,4 @@
-"""Imports point one way, as DESIGN.md draws them, and what runs in a frame runs without torch."""
+"""Imports point one way, as docs/architecture.md draws them, and what runs in a frame runs without torch."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def is_read_by_the_python_client(kind: str, body: bytes) -> bool:
         case "h":
             read_welcome(reply)
         case "s":
-            read_bots_started(reply, golden)
+            read_bots_started(reply, golden, 2)
         case "q":
             read_queries(reply, 2, TABLE)
         case "a":

@@ -169,7 +169,7 @@ def read_by_python(asked: str, body: bytes) -> None:
         case "hello":
             read_welcome(reply)
         case "start_bots":
-            read_bots_started(reply, read_welcome(read_reply(VECTORS["welcome"].body, "hello")))
+            read_bots_started(reply, read_welcome(read_reply(VECTORS["welcome"].body, "hello")), len(BOTS))
         case "request_queries":
             read_queries(reply, len(BOTS), TABLE)
         case "submit_features":

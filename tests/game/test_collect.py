@@ -1,5 +1,6 @@
 import io
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from game.collect import Collect, collect, dataset_id, play_episode
+from game.collect import Collect, collect, dataset_id, main, play_episode
 from game.env import ACTION_SPEC, NavigationEnv, feature_table
 from game.players import Player
 from game.recording import summarise, write_shard
@@ -135,3 +136,15 @@ def test_what_was_intended_is_recorded_not_what_a_kick_made_of_it(easy, monkeypa
 
 def _recorded_actions(env, config):
     return play_episode(env, Player(config.skill, env.terrain), 7, config.kick_chance).actions
+
+
+@pytest.mark.parametrize("settings", [{"episodes": 0}, {"workers": 0}, {"sight_m": 0.0}])
+def test_refuses_settings_that_cannot_be(settings: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        Collect(**settings)
+
+
+def test_a_map_that_is_none_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["collect", "--map", "nosuch", "--episodes", "1", "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit, match="error: .*nosuch"):
+        main()

@@ -17,6 +17,7 @@ from protocol.codec import Format
 from protocol.errors import ProtocolError
 from protocol.messages import Actions, Queries, Reply, Request, RequestQueries, SubmitFeatures, TakeTurn, Welcome
 from protocol.replies import read_actions, read_bots_started, read_queries, read_reply, read_welcome
+from protocol.transport import ReplyError
 from protocol.vectors.__main__ import write_vectors
 from tests.protocol.golden import BOTS, FOLDER, REFUSED, REPLIES, REQUESTS, TABLE, VECTORS, WELCOME, Vector
 
@@ -190,7 +191,10 @@ def test_the_client_reads_replies_field_for_field() -> None:
         welcome = read_welcome(read_reply(VECTORS[name].body, "hello"))
         said = msgspec.convert(VECTORS[name].message, Welcome)
         assert welcome._asdict() == {name: getattr(said, name) for name in welcome._fields}
-    handles, started = read_bots_started(read_reply(VECTORS["bots_started"].body, "start_bots"), welcome)
+    reply = read_reply(VECTORS["bots_started"].body, "start_bots")
+    handles, started = read_bots_started(reply, welcome, len(BOTS))
+    with pytest.raises(ReplyError):
+        read_bots_started(reply, welcome, len(BOTS) - 1)
     assert handles.tolist() == BOTS
     assert (welcome.bundle_version, started.bundle_version) == (None, 3)
     assert started == welcome._replace(bundle_version=3, bundle_sha256=WELCOME.bundle_sha256)

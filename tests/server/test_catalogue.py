@@ -13,10 +13,13 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
+from bot_runtime.bundle import Bundle
 from protocol.client import BotClient
 from protocol.errors import BadBundle, NoBot, NoBundle
 from protocol.resuming import ResumingClient
 from server.catalogue import Catalogue
+from server.listing import in_memory
+from server.serving import Serving
 from server.servings import Servings
 from server.store import Store
 from server.worker import Worker
@@ -109,6 +112,7 @@ def test_versions_are_exchanged_while_bots_play_and_rolled_back(served: Served) 
         states = {version["version"]: version["state"] for version in listed(served)["tiny"]["versions"]}
         assert states == {1: "active", 2: "stored", 3: "held"}
         assert listed(served)["tiny"]["versions"][2]["bots"] == 2
+        assert [version["precision"] for version in listed(served)["tiny"]["versions"]] == ["fp32", None, "fp32"]
     assert json.loads(admin(served, "tiny/rollback").body)["active"]["version"] == 3
     assert json.loads(admin(served, "tiny/rollback").body)["active"]["version"] == 1
 
@@ -232,6 +236,13 @@ def test_connections_that_hold_on_to_old_versions_do_not_fill_the_memory(
         assert admin(served, "tiny/activate", {"version": 2}).status == 200
 
 
+def test_the_listing_tells_int8_bundles() -> None:
+    shipped = Bundle.load(Path(__file__).parents[2] / "bundles" / "hard-int8", replay=False)
+    servings = Servings(8)
+    servings.activate(Serving(shipped, max_bots=8))
+    assert [version.precision for version in in_memory(servings)["hard-int8"].values()] == ["int8"]
+
+
 def test_a_store_with_more_names_than_may_be_in_memory_is_not_opened(store: Path) -> None:
     worker = Worker(max_queue=1)
     try:
@@ -239,6 +250,32 @@ def test_a_store_with_more_names_than_may_be_in_memory_is_not_opened(store: Path
             Catalogue(Store(store), Servings(8, max_loaded=1), worker, max_bots=8).open()
     finally:
         worker.close()
+
+
+def test_a_client_without_bots_resumes_on_whatever_is_active(served: Served) -> None:
+    with ResumingClient(served.addresses["unix"], timeout_s=WAIT_S) as client:
+        client.hello(token=TOKEN, bundle="tiny")
+        assert client.stop(client.start(2)) == 2
+        assert admin(served, "tiny/activate", {"version": 1}).status == 200
+        client._client._transport.close()
+        bots = client.start(1)
+        assert client.welcome.bundle_version == 1
+        play(client, client.welcome.features, bots, range(3))
+
+
+def test_bots_that_were_resumed_hold_their_version_and_the_next_ones_do_not(served: Served) -> None:
+    with ResumingClient(served.addresses["unix"], timeout_s=WAIT_S) as client:
+        client.hello(token=TOKEN, bundle="tiny")
+        table, bots = client.welcome.features, client.start(1)
+        play(client, table, bots, range(2))
+        client._client._transport.close()
+        play(client, table, bots, range(2, 4))
+        assert admin(served, "tiny/activate", {"version": 1}).status == 200
+        others = client.start(1)
+        assert (client.resumed, client.welcome.bundle_version) == (1, 3)
+        client.stop(np.concatenate([bots, others]))
+        play(client, table, client.start(1), range(2))
+        assert client.welcome.bundle_version == 1
 
 
 def test_a_line_that_breaks_after_an_exchange_ends_its_bots_for_good(served: Served) -> None:

@@ -22,7 +22,7 @@ def test_a_request_that_is_refused_breaks_the_silence_and_one_that_comes_too_lat
     assert connections.heard(talking.id) is talking
     for _ in range(2):
         assert connections.heard(late.id) is None
-    assert connections.remove_silent() == [late]
+    assert connections.silent() == [late]
     assert connections.heard(None) is None
 
 
@@ -35,8 +35,9 @@ def test_silence_is_measured_by_the_given_clock_and_any_request_breaks_it(servin
         assert connections.get(talking.id) is talking
     with pytest.raises(NoConnection):
         connections.get(silent.id)
-    assert connections.remove_silent() == [silent]
-    assert connections.remove_silent() == []
+    assert connections.silent() == [silent]
+    connections.remove(silent.id)
+    assert connections.silent() == []
     assert len(connections) == 1
 
 

@@ -108,9 +108,7 @@ def test_only_small_turns_and_refusals_are_answered_on_the_loop(at_desk: Callabl
     at_desk(test)
 
 
-def test_a_deadline_begins_no_earlier_than_its_connections_last_answer(
-    at_desk: Callable[..., None],
-) -> None:
+def test_a_deadline_begins_no_earlier_than_its_connections_last_answer(at_desk: Callable[..., None]) -> None:
     async def test(counter: Counter) -> None:
         bots = await counter.start(1)
         assert [await counter.query(bots) for _ in range(2)] == [False, True]
@@ -123,6 +121,12 @@ def test_a_deadline_begins_no_earlier_than_its_connections_last_answer(
         assert connection.answered_ns == counter.now_ns
         assert own.due_ns == counter.now_ns + 1_000_000
         assert others.due_ns <= counter.now_ns + 700_000
+        counter.us = 5000.0
+        for _ in range(9):
+            await counter.query(bots)  # the last by the worker
+        await counter.look_again()
+        assert threading.get_ident() != counter.threads[-1]
+        assert connection.answered_ns == counter.now_ns
 
     at_desk(test)
 

@@ -10,6 +10,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from protocol import transport, websocket
 from protocol.client import BotClient
 from protocol.errors import NoBot, NoConnection, ProtocolError, TooManyBots, TooManyConnections, Unauthorized
 from tests.protocol.golden import TABLE, VECTORS
@@ -220,6 +221,27 @@ def test_a_client_may_say_hello_again(served: Served, door: str) -> None:
         client.start(1)
         assert client.hello().connection != first
         assert client.stop(client.start(1)) == 1
+
+
+@pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
+def test_an_answer_that_was_not_waited_for_is_nobodys(
+    served: Served, door: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C while a request is under way, and the program goes on."""
+
+    def interrupted(*_: object) -> bytes:
+        raise KeyboardInterrupt
+
+    with BotClient(served.addresses[door]) as client:
+        client.hello()
+        with monkeypatch.context() as patch:
+            for name in ("_read_http", "_read_frame"):
+                patch.setattr(transport, name, interrupted)
+            patch.setattr(websocket.WebSocketTransport, "_receive", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                client.start(2)
+        client.hello()
+        assert client.start(1).size == 1
 
 
 def test_a_summary_may_be_asked_for_by_name(served: Served) -> None:

@@ -10,7 +10,7 @@ import pytest
 from bot_runtime.bundle import Bundle
 from bot_runtime.work import finished
 from protocol.codec import Format
-from protocol.errors import NoBundle, TooManyBots
+from protocol.errors import NoBundle, TooManyBots, TooManyConnections
 from protocol.messages import Goodbye, Hello, RequestQueries, StartBots, StopBots
 from server.connections import Connections
 from server.handlers import Handlers
@@ -69,6 +69,32 @@ def test_an_old_one_is_forgotten_with_its_last_connection_however_that_ends(vers
     handlers.end_silent()
     assert [serving.bots.bundle for serving in servings] == [versions[1]]
     assert servings.n_bots == 0
+
+
+def test_hello_keeps_the_version_that_it_names_though_who_held_it_is_swept(versions: list[Bundle]) -> None:
+    """As when a client comes back for its bots after its time to live, and another version is active."""
+    clock = FakeClock()
+    handlers, servings = _served(clock=clock)
+    old = Serving(versions[0], max_bots=8, version=1)
+    servings.activate(old)
+    silent = finished(handlers.steps(Hello(), None, FORM)).connection
+    finished(handlers.steps(StartBots(2), silent, FORM))
+    servings.activate(Serving(versions[1], max_bots=8, version=2))
+    clock.now += 61.0
+    back = finished(handlers.steps(Hello(bundle=f"{old.name}@{old.version}"), None, FORM)).connection
+    finished(handlers.steps(StartBots(3), back, FORM))
+    assert (len(list(servings)), servings.n_bots, old.n_connections) == (2, 3, 1)
+    finished(handlers.steps(Goodbye(), back, FORM))
+    assert (len(list(servings)), servings.n_bots, old.n_connections) == (1, 0, 0)
+
+
+def test_a_hello_that_finds_no_room_holds_nothing(versions: list[Bundle]) -> None:
+    handlers, servings = _served(versions[0])
+    for _ in range(4):
+        finished(handlers.steps(Hello(), None, FORM))
+    with pytest.raises(TooManyConnections):
+        finished(handlers.steps(Hello(), None, FORM))
+    assert servings.named(None).n_connections == len(handlers.connections) == 4
 
 
 def test_one_that_nobody_holds_is_forgotten_when_it_is_replaced(versions: list[Bundle]) -> None:
