@@ -146,5 +146,5 @@ def test_refuses_settings_that_cannot_be(settings: dict[str, object]) -> None:
 
 def test_a_map_that_is_none_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["collect", "--map", "nosuch", "--episodes", "1", "--out", str(tmp_path / "out")])
-    with pytest.raises(SystemExit, match="error: .*nosuch"):
+    with pytest.raises(SystemExit, match=r"error: .*nosuch"):
         main()
