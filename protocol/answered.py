@@ -15,8 +15,6 @@ from protocol.replies import Actions, Queries
 
 __all__ = ["Answered", "Answers"]
 
-_MAX_COMPANIES = 256
-
 
 class Answered(NamedTuple):
     """One turn, what was answered so far, and how often the client had resumed by then."""
@@ -36,8 +34,10 @@ class Answered(NamedTuple):
 class Answers:
     """The last turn of each of the companies, bots in one order, that were heard of last."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int) -> None:
+        """`most` is the welcome's `max_bots`: a turn that was begun must be known until it ends."""
         self._turns: dict[tuple[int, ...], Answered] = {}
+        self._most = 2 * most  # a bot may be in one that is under way, and in another that is over
 
     def last(self, bots: Sequence[int]) -> Answered | None:
         """The last turn of exactly these bots, in this order."""
@@ -49,10 +49,11 @@ class Answers:
         return turn if turn is not None and turn.asked.frame == frame and turn.resumed != resumed else None
 
     def keep(self, turn: Answered) -> None:
-        """This is the last one of its bots; where there are too many, the oldest is forgotten."""
+        """This is the last one of its bots; where there are too many, the oldest that is over is forgotten."""
         self._turns.pop(turn.asked.bots, None)
-        if len(self._turns) == _MAX_COMPANIES:
-            del self._turns[next(iter(self._turns))]
+        if len(self._turns) >= self._most:
+            over = (bots for bots, each in self._turns.items() if each.actions is not None)
+            del self._turns[next(over, next(iter(self._turns)))]
         self._turns[turn.asked.bots] = turn
 
     def forget(self, bots: Sequence[int]) -> None:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, ParamSpec, Self, TypeVar
 
 import msgpack
 import numpy as np
@@ -26,6 +26,7 @@ from protocol.replies import (
     Welcome,
     read_actions,
     read_bots_started,
+    read_bots_stopped,
     read_queries,
     read_reply,
     read_welcome,
@@ -34,13 +35,17 @@ from protocol.transport import ReplyError, open_transport
 
 __all__ = ["Actions", "BotClient", "Queries", "ReplyError", "Welcome"]
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 
 class BotClient:
     """One connection to a server at `http://host:port`, `ws://host:port`, `tcp://host:port` or `unix:///path`.
 
     Every method raises the ProtocolError of the server's answer; OSError (TimeoutError, ConnectionError, ReplyError)
     where there is none. A socket that failed is closed: over HTTP the next call opens another and the connection goes
-    on; over TCP and Unix sockets the connection and its bots have ended, so say hello again.
+    on; over TCP and Unix sockets the connection and its bots have ended, so say hello again. `timeout_s` is of each
+    wait for the server, not of a whole call: one that sends a byte now and then is waited for.
     """
 
     def __init__(
@@ -97,7 +102,7 @@ class BotClient:
             message["token"] = token
         if bundle is not None:
             message["bundle"] = bundle
-        self._welcome = read_welcome(self.exchange(message))
+        self._welcome = self._read(read_welcome, self.exchange(message))
         return self._welcome
 
     def start(
@@ -122,7 +127,7 @@ class BotClient:
         add_numbers(message, "target_costs_us", target_costs_us)
         if turns is not None:
             message["turns"] = [int(taken) for taken in turns]
-        handles_N, self._welcome = read_bots_started(self.exchange(message), self.welcome, int(count))
+        handles_N, self._welcome = self._read(read_bots_started, self.exchange(message), self.welcome, int(count))
         return handles_N
 
     def query(
@@ -151,7 +156,7 @@ class BotClient:
         add_numbers(message, "budgets_us", budgets_us)
         add_numbers(message, "target_costs_us", target_costs_us)
         add_number(message, "deadline_us", deadline_us)
-        return read_queries(self._framed(message), len(handles), table)
+        return self._read(read_queries, self._framed(message), len(handles), table)
 
     def act(
         self,
@@ -179,7 +184,7 @@ class BotClient:
         add_number(message, "deadline_us", deadline_us)
         if hidden:
             message["hidden"] = True
-        return read_actions(self._framed(message), len(handles), welcome.action)
+        return self._read(read_actions, self._framed(message), len(handles), welcome.action)
 
     def take(
         self,
@@ -216,11 +221,11 @@ class BotClient:
             message["hidden"] = True
         add_numbers(message, "replayed_returns_to_go", replayed_returns_to_go)
         add_number(message, "deadline_us", deadline_us)
-        return read_actions(self._framed(message), len(handles), welcome.action)
+        return self._read(read_actions, self._framed(message), len(handles), welcome.action)
 
     def stop(self, bots: ArrayLike) -> int:
         """End these bots; returns how many ended."""
-        return int(self.exchange({"type": "stop_bots", "bots": handles_of(bots)})["count"])
+        return self._read(read_bots_stopped, self.exchange({"type": "stop_bots", "bots": handles_of(bots)}))
 
     def close(self) -> None:
         """End the connection and its bots, and close the socket. A server that is gone already is no error."""
@@ -237,8 +242,11 @@ class BotClient:
         """Send any message, as a dict, and return its reply's dict: the door for tests and for messages to come."""
         connection = None if self._welcome is None else self._welcome.connection
         body = self._transport.exchange(message["type"], self._packer.pack(message), connection)
+        return self._read(read_reply, body, message["type"])
+
+    def _read(self, read: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
         try:
-            return read_reply(body, message["type"])
+            return read(*arguments, **named)
         except (NoConnection, TooManyConnections, ReplyError):  # nothing sensible will be answered on this socket
             self._transport.close()
             raise

@@ -22,6 +22,7 @@ __all__ = [
     "Welcome",
     "read_actions",
     "read_bots_started",
+    "read_bots_stopped",
     "read_queries",
     "read_reply",
     "read_welcome",
@@ -150,6 +151,14 @@ def read_bots_started(reply: dict[str, Any], welcome: Welcome, count: int) -> tu
         return np.array(reply["bots"], dtype=np.int64).reshape(count), welcome._replace(**_read_version(reply))
     except _FAULTS as error:
         raise _unreadable("start_bots", error) from error
+
+
+def read_bots_stopped(reply: dict[str, Any]) -> int:
+    """How many ended; raises ReplyError."""
+    try:
+        return int(reply["count"])
+    except _FAULTS as error:
+        raise _unreadable("stop_bots", error) from error
 
 
 def read_queries(reply: dict[str, Any], bots: int, table: FeatureTable) -> Queries:

@@ -62,7 +62,7 @@ class ResumingClient:
         self._is_held = False  # to the version of bots that were resumed
         self._history = History(1)
         self._names = Names()
-        self._turns = Answers()
+        self._turns = Answers(1)  # until hello tells
         self._clock = clock
         self.resumed = self.n_late = 0
 
@@ -91,7 +91,7 @@ class ResumingClient:
         if self._welcome.replay_frames is None:
             raise ReplyError("this server cannot resume bots: it is older than this client")
         self._said, self._history, self._is_held = said, History(self._welcome.replay_frames), False
-        self._names.now, self._turns = {}, Answers()
+        self._names.now, self._turns = {}, Answers(self._welcome.max_bots)
         return self._welcome
 
     def start(

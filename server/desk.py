@@ -175,10 +175,8 @@ class Desk:
             answered = self._worker.run(partial(self._answered_there, asked, self._clock()), asked.work_us)
         except NotReady as error:
             return self._refuse(asked, error)
-        if asked.arrival.deadline is not None:
-            answered = self.due.watched(asked.arrival.deadline, answered, asked.form)
-        answered.add_done_callback(lambda _: self._answered(asked))
-        return answered
+        deadline = asked.arrival.deadline
+        return answered if deadline is None else self.due.watched(deadline, answered, asked.form)
 
     def _is_quick(self, asked: Asked) -> bool:
         return asked.turn is not None and self._worker.is_idle and asked.pace.expected_us(asked.turn) <= self._inline_us
@@ -213,6 +211,7 @@ class Desk:
         if asked.turn is not None:
             asked.pace.observe(asked.turn, (self._worker_clock() - worker_ns) / 1e3)
         self._ended_ns = self._clock()
+        self._answered(asked)
         _note(asked, answered, (self._ended_ns - begun_ns) / 1e3)
         return answered
 

@@ -15,7 +15,7 @@ typedef char botsp_double_has_8_bytes[sizeof(double) == 8 ? 1 : -1];
 
 static bots_status dial(bots_client *client)
 {
-    return botsp_dial(&client->address, botsp_now_ns(NULL) + client->timeout_ns, &client->fd);
+    return botsp_dial(&client->address, client->until_ns, &client->fd);
 }
 
 bots_status bots_connect(const char *url, const bots_options *options, bots_client **client)
@@ -49,6 +49,7 @@ bots_status bots_connect(const char *url, const bots_options *options, bots_clie
     made->spin_ns = (uint64_t)options->spin_us * 1000u;
     made->address = address;
     made->fd = -1;
+    made->until_ns = botsp_now_ns(NULL) + made->timeout_ns;
     status = dial(made);
     if (status == BOTS_OK) {
         *client = made;
@@ -110,9 +111,9 @@ bots_status bots_hello(bots_client *client, const bots_hello_fields *fields, con
     status = check_hello(client, fields);
     if (status != BOTS_OK)
         return status;
+    writer = botsp_begin(client, "hello");
     if (client->fd < 0 && (status = dial(client)) != BOTS_OK)
         return botsp_fail(client, status, "no socket to the server");
-    writer = botsp_begin(client, "hello");
     botsp_field(&writer, "protocol");
     botsp_put_integer(&writer, 1);
     if (fields->call_us != NULL)

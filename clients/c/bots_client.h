@@ -11,7 +11,7 @@ struct bots_client {
     botsp_memory memory;
     uint64_t (*clock_ns)(void *context);
     void *clock_context;
-    uint64_t timeout_ns, spin_ns;
+    uint64_t timeout_ns, spin_ns, until_ns; /* the last: when the call that is under way ends */
     botsp_address address;
     int fd; /* -1: closed */
     int is_welcome; /* between hello and whatever ended the connection */
@@ -30,7 +30,7 @@ struct bots_client {
 bots_status botsp_fail(bots_client *client, bots_status status, const char *detail);
 /* The same for what leaves no connection behind: the socket is closed. */
 bots_status botsp_break(bots_client *client, bots_status status, const char *detail);
-/* A message of this type in the client's request buffer; fields follow, at most 14. */
+/* A message of this type in the client's request buffer; fields follow, at most 14. From now on its call has its time. */
 botsp_writer botsp_begin(bots_client *client, const char *type);
 /* A field's name; its value follows. */
 void botsp_field(botsp_writer *writer, const char *name);

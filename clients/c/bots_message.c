@@ -85,6 +85,7 @@ botsp_writer botsp_begin(bots_client *client, const char *type)
 {
     botsp_writer writer;
     uint8_t *start;
+    client->until_ns = botsp_now_ns(NULL) + client->timeout_ns;
     writer.buffer = &client->request;
     writer.memory = &client->memory;
     writer.size = 0;
@@ -187,7 +188,7 @@ static const char *why(bots_status status)
 
 bots_status botsp_exchange(bots_client *client, botsp_writer *writer, const char *expected, botsp_reader *reply)
 {
-    uint64_t until_ns = botsp_now_ns(NULL) + client->timeout_ns;
+    uint64_t until_ns = client->until_ns;
     size_t size = writer->size, body = size - PREFIX_BYTES, i;
     uint8_t *bytes = client->request.bytes;
     bots_status status;

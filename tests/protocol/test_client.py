@@ -130,6 +130,23 @@ def test_an_answer_that_comes_after_its_deadline_is_late_whatever_it_says() -> N
         client._transport.close()
 
 
+def test_what_cannot_be_read_closes_the_socket_and_the_next_hello_dials_anew() -> None:
+    odd = [msgpack.packb({"type": kind}) for kind in ("welcome", "bots_started", "bots_stopped", "queries")]
+    bad = [struct.pack(">I", len(body)) + body for body in odd]
+    welcome = VECTORS["welcome"].frame
+    with scripted([bad[0]], [welcome, bad[1]], [welcome, bad[2]], [welcome, bad[3]], [welcome]) as (port, _):
+        client = BotClient(f"tcp://127.0.0.1:{port}")
+        with pytest.raises(ReplyError):
+            client.hello()
+        for ask in (lambda: client.start(2), lambda: client.stop(BOTS), lambda: client.query(BOTS, 7, FREE)):
+            client.hello()
+            with pytest.raises(ReplyError):
+                ask()
+            assert client._transport._socket is None
+        client.hello()
+        client._transport.close()
+
+
 @pytest.mark.parametrize(
     "reply",
     [

@@ -11,7 +11,7 @@ import pytest
 
 from bot_runtime.bundle import Bundle
 from protocol.errors import NoBot, NoConnection, NoPendingQuery, OutOfRange
-from protocol.replies import Welcome
+from protocol.replies import Actions, Welcome
 from protocol.resuming import ResumingClient
 from tests.bundles import make_bundle
 from tests.protocol.golden import TABLE, WELCOME
@@ -158,6 +158,25 @@ def test_refusals_come_through_and_change_nothing(tiny: Bundle) -> None:
     unbroken = resuming(Mortal(tiny, {}))
     unbroken.hello()
     assert same(played, play(unbroken, TABLE, unbroken.start(2, seeds=[1, 2]), range(12)))
+
+
+def test_as_many_turns_may_be_under_way_as_there_are_bots(tiny: Bundle) -> None:
+    """Each bot a company of its own: all are asked for before the first acts, and the server dies in between."""
+    mortal = Mortal(tiny, {12: "before"})
+    client, unbroken = resuming(mortal), resuming(Mortal(tiny, {}))
+    acted: dict[int, list[Actions]] = {0: [], 1: []}
+    for n, each in enumerate((client, unbroken)):
+        each.hello()
+        assert each.welcome.max_bots == 8
+        bots = each.start(8, seeds=range(8))
+        for frame in range(3):
+            free, costly = free_numbers(TABLE, 1, frame), costly_numbers(TABLE, 1, frame)
+            asked = [each.query([bot], frame, free) for bot in bots]
+            acted[n] += [each.act([bot], frame, q.queries, costly) for bot, q in zip(bots, asked, strict=True)]
+    assert client.resumed == 1
+    for mine, theirs in zip(acted[0], acted[1], strict=True):
+        assert same([mine], [theirs])
+        assert mine.turns.tolist() == theirs.turns.tolist()
 
 
 def test_it_gives_up_after_its_limit_and_can_be_asked_again(tiny: Bundle) -> None:

@@ -106,7 +106,7 @@ def test_shipped_maps_fit_their_environments() -> None:
     """Checked against the sizes that gymnasium documents, so that no simulator is needed."""
     folder = Path(__file__).parents[2] / "training" / "feature_maps"
     sizes = {"halfcheetah": 17, "hopper": 11, "walker2d": 17}
-    copies = {"halfcheetah-nl": 2, "halfcheetah-nl-faint": 2, "halfcheetah-nlh": 3}
+    copies = {"halfcheetah-nl": 2, "halfcheetah-nl-faint": 2, "halfcheetah-nlh": 3, "halfcheetah-nlh-faint": 3}
     for file in sorted(folder.glob("*.json")):
         size = sizes[file.stem.partition("-")[0]]
         table = FeatureMap.read(file).table({"": size})

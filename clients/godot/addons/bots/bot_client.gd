@@ -4,8 +4,8 @@ extends Reference
 # Every request has two forms. `query(...)` waits for the reply, at most `timeout_s`, and returns it; `begin_query(...)`
 # only sends, and poll() returns the reply once it is there and null until then, without ever waiting. One request at a
 # time. Replies are Dictionaries with `ok`; where that is false they have `code`, `detail` and `retry_after_s`
-# (errors.gd). After CONNECTION_LOST, TIMED_OUT or BAD_REPLY the socket is closed and the bots have ended: connect and
-# say hello again. After any other failure nothing has changed.
+# (errors.gd). After those of _ENDING that came with a reply, or for want of one, the socket is closed and the bots have
+# ended: connect and say hello again. After any other failure nothing has changed.
 #
 # This file knows nothing about rays: see rays.gd. N bots, F free numbers, M costly features, A numbers of an action.
 
@@ -19,7 +19,9 @@ const _LOOK_USEC := 20  # between two looks at the socket while a call waits; th
 const _FAREWELL_S := 0.5
 
 # After these nothing else is answered on the socket.
-const _ENDING := [Errors.CONNECTION_LOST, Errors.TIMED_OUT, Errors.BAD_REPLY, "NO_CONNECTION", "TOO_MANY_CONNECTIONS"]
+const _ENDING := [
+	Errors.CONNECTION_LOST, Errors.TIMED_OUT, Errors.BAD_REPLY, "NO_CONNECTION", "TOO_LARGE", "TOO_MANY_CONNECTIONS"
+]
 
 var timeout_s := 5.0
 var welcome = null  # what `hello` was answered; `welcome.table` is a feature_table.gd
