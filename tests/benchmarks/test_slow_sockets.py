@@ -31,7 +31,7 @@ def test_sockets_that_are_not_closed_are_found(tmp_path: Path) -> None:
 
 def test_a_run_visits_every_door(tmp_path: Path) -> None:
     config = SlowSockets(
-        make_bundle(tmp_path / "tiny"), 4, bots=1, rounds=2, quiet_s=0.1, deadline_s=0.2, patience_s=0.5
+        make_bundle(tmp_path / "tiny"), 4, bots=1, rounds=2, quiet_s=0.1, deadline_s=1.0, patience_s=0.5
     )
     doors = measure(config)
     assert {"http", "ws", "tcp", "unix"} <= set(doors)
