@@ -101,8 +101,8 @@ class Connections:
         return connection
 
     def heard(self, connection_id: str | None) -> Connection | None:
-        """The connection of this name, of which a request has come, whatever becomes of it; None where there is none, or
-        it was silent for too long before."""
+        """The connection of this name, of which a request has come, whatever becomes of it; None where there is none,
+        or it was silent for too long before."""
         connection, now_s = self.peek(connection_id), self._clock()
         if connection is None or self._is_silent(connection, now_s):
             return None
