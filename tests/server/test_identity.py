@@ -215,8 +215,9 @@ def test_requests_that_are_refused_keep_a_connection_and_its_socket_outlives_one
 
 
 @pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
-def test_a_client_may_say_hello_again(served: Served, door: str) -> None:
-    with BotClient(served.addresses[door]) as client:
+def test_a_client_may_say_hello_again(bundle: Path, tmp_path: Path, door: str) -> None:
+    """Over HTTP the bots of before last for their time to live: on a server that no other test needs."""
+    with serve(bundle, tmp_path / "s") as served, BotClient(served.addresses[door]) as client:
         first = client.hello().connection
         client.start(1)
         assert client.hello().connection != first
@@ -225,14 +226,14 @@ def test_a_client_may_say_hello_again(served: Served, door: str) -> None:
 
 @pytest.mark.parametrize("door", ["http", "tcp", "unix", "ws"])
 def test_an_answer_that_was_not_waited_for_is_nobodys(
-    served: Served, door: str, monkeypatch: pytest.MonkeyPatch
+    bundle: Path, tmp_path: Path, door: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C while a request is under way, and the program goes on."""
+    """Ctrl-C while a request is under way, and the program goes on; on a server of its own, as above."""
 
     def interrupted(*_: object) -> bytes:
         raise KeyboardInterrupt
 
-    with BotClient(served.addresses[door]) as client:
+    with serve(bundle, tmp_path / "s") as served, BotClient(served.addresses[door]) as client:
         client.hello()
         with monkeypatch.context() as patch:
             for name in ("_read_http", "_read_frame"):
