@@ -56,7 +56,7 @@ class Ray(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Feature name: `ray_l075_d08_r010` looks 75 degrees left and 10 down, 10 m far."""
+        """Feature name: `ray_l075_d08_r010` looks 75 degrees left and 8 down, 10 m far."""
         side, tilt = "l" if self.left_deg >= 0 else "r", "d" if self.down_deg >= 0 else "u"
         return f"ray_{side}{abs(self.left_deg):03d}_{tilt}{abs(self.down_deg):02d}_r{self.range_m:03d}"
 
